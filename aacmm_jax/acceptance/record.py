@@ -193,6 +193,7 @@ class EvaluationRecord(NamedTuple):
     standards: tuple[str, ...] = tuple(STANDARDS)  # whose acceptance tests are run, in addition to those with a limit
     uncertainty: Uncertainty | None = None  # of the calibrated arm; files of earlier versions have none
     calibration_warnings: tuple[str, ...] = ()  # what should be read about the calibration itself
+    calibration_unusable: str | None = None  # why the calibration is not to be used, if it is not
     influences: Influences = NO_INFLUENCES
     rule: Rule | None = None  # None: that of each standard
 

@@ -1,5 +1,6 @@
 """The record of a calibration: everything that a file keeps of it, in plain arrays; and its uncertainty."""
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ from ..core._compat import member_numbers
 from ..core.arguments import checked_arguments
 from ..core.numpy_or_jax import to_numpy
 from ..data.noise import Noise
+from ..data.observations.observation import stated_u
 from ..data.recording import Recording
 from ..kinematics.arm import Arm, joint_limits, parameter_names, value_of
 from ..kinematics.corrected_arm import function_values
@@ -29,12 +31,15 @@ from .results import (
     NoisyEncoder,
     ObservedMetrics,
     PriorMetrics,
+    converged,
     largest_plausible_residual,
     plausible,
 )
 from .stages import against_division
 
 REPEATABILITY = "repeatability"  # method of stage 1 alone
+# First words of the reason where the solve ended, but with a k that is not plausible.
+SCALE_REFUSED = "Not usable: the scale factor k"
 _POINTS = 400  # of a joint's corrections as a function of its reading
 _BEYOND = 0.15  # of a joint's travel, on either side of it, where its corrections are given
 _CORRELATED = 0.1  # smallest eigenvalue of correlations, below which parameters slide along each other
@@ -142,17 +147,33 @@ class CalibrationRecord(NamedTuple):
         return self.divided and len(self.recording.capture.lengths) == 1
 
     @property
+    def residual(self) -> float:
+        """RMS distance of the poses from their geometry, mm; without those that a robust loss took weight from."""
+        return self.observed.rms if self.robust is None else float(np.sqrt(3) * self.observed.sigma)
+
+    @property
     def largest_plausible_residual(self) -> float:
         """RMS distance from the geometry, mm, that no arm of this size and class exceeds with its own data."""
-        usual = self.recording.usual
-        return largest_plausible_residual(self.calibrated.arm, self.given_noise, None if usual is None else usual.noise)
+        return self._largest_residual(only_usual=False)
+
+    @property
+    def largest_usual_residual(self) -> float:
+        """RMS distance from the geometry, mm, above which a mistake in the data is looked for."""
+        return self._largest_residual(only_usual=True)
 
     @property
     def implausible_residual(self) -> bool:
         """Whether the residual is larger than that of any such arm, so that data and arm do not belong together."""
-        # Bad poses do not count where a robust loss took their weight.
-        rms = self.observed.rms if self.robust is None else float(np.sqrt(3) * self.observed.sigma)
-        return rms > self.largest_plausible_residual
+        return self.residual > self.largest_plausible_residual
+
+    def _largest_residual(self, only_usual: bool) -> float:
+        noises = self.given_noise, None if self.recording.usual is None else self.recording.usual.noise
+        # Of each observation at most three coordinates; a socket has no measured point.
+        capture = self.recording.capture
+        stated_of = [(len(part.q), stated_u(part)) for part in capture.observations]
+        squares = sum(poses * 3 * float(np.mean(u**2)) for poses, u in stated_of if len(u))
+        stated = math.sqrt(squares / len(capture.readings))
+        return largest_plausible_residual(self.calibrated.arm, *noises, stated_rms=stated, only_usual=only_usual)
 
     def vectors(self) -> dict[str, np.ndarray]:
         """Free parameters of the nominal arm, after stage 1, and calibrated; and of the true arm of a simulation."""
@@ -247,6 +268,12 @@ def _reason(calibration: Calibration | Identification) -> str:
     result = calibration.result if bool(stage1.converged) else stage1.result
     sentence, number = Reason[result], int(member_numbers(result))
     covariance = np.asarray(calibration.covariance)
+    if not bool(calibration.converged) and bool(converged(result)):
+        # What the solve says of itself would contradict that.
+        k = calibration.stage1.k
+        if k is not None and not bool(plausible(k)):
+            return f"{SCALE_REFUSED} = {float(k):.6g} is not plausible."
+        return "Not converged: a parameter is not finite; check the data and the start."
     sd = np.sqrt(np.diag(covariance))
     moving = np.flatnonzero(sd > 0)
     if number not in (MAX_STEPS, STALLED) or not len(moving) or not np.all(np.isfinite(covariance)):

@@ -31,8 +31,10 @@ _GOOD = [int(member_numbers(reason)) for reason in (Reason.gradient, Reason.step
 PLAUSIBLE_SCALE = (0.5, 2.0)
 # Repeatability of an arm or robot relative to the sum of its links: the paper's arm reaches 1e-5 (0.026 mm on 2.5 m).
 _RELATIVE_REPEATABILITY = 1e-5
-# Residuals larger by these factors come from wrong data, not from an arm: than that, and than its noise predicts.
-_OVER_REPEATABILITY, _OVER_NOISE = 100.0, 10.0
+# Residuals larger by these factors than that are looked into; and come from wrong data, not from an arm, because they
+# exceed what a nominal arm leaves before it is calibrated (0.5 % of its size). What is stated (noise of the arm,
+# uncertainty of what was measured) may be this many times too small.
+_UNUSUAL, _OVER_REPEATABILITY, _OVER_STATED = 100.0, 500.0, 10.0
 
 
 class PriorMetrics(eqx.Module):
@@ -370,15 +372,20 @@ def plausible(k: Any) -> Any:
     return (k >= PLAUSIBLE_SCALE[0]) & (k <= PLAUSIBLE_SCALE[1])
 
 
-def largest_plausible_residual(arm: Arm, *noises: Noise | None) -> float:
+def largest_plausible_residual(
+    arm: Arm, *noises: Noise | None, stated_rms: float = 0.0, only_usual: bool = False
+) -> float:
     """RMS distance from the sockets' centroids, mm, above which data and arm do not belong together.
 
-    A hundred times the repeatability of a good arm of this size, or, where that is more, ten times what one of the
-    noises predicts at full reach: that which was given, and that which is usual for the class of the arm.
+    What a nominal arm of this size leaves, or, where that is more, ten times what was stated: what one of the noises
+    predicts at full reach (that which was given, and that which is usual for the class of the arm), or the RMS
+    uncertainty of what was measured, ``stated_rms``, mm. ``only_usual``: above which the residuals are unusual for a
+    calibrated arm of this size, so that a mistake in the data is looked for.
     """
     size = total_link_length(arm)
     predicted = [math.sqrt(3) * math.hypot(*at_tip(noise, arm, size)) for noise in noises if noise is not None]
-    return max([_OVER_REPEATABILITY * _RELATIVE_REPEATABILITY * size, *(_OVER_NOISE * rms for rms in predicted)])
+    of_size = (_UNUSUAL if only_usual else _OVER_REPEATABILITY) * _RELATIVE_REPEATABILITY * size
+    return max([of_size, *(_OVER_STATED * rms for rms in (*predicted, stated_rms))])
 
 
 def active_names(space: Parameters, active: Numbers) -> dict[str, str]:

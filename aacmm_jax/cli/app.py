@@ -160,8 +160,16 @@ def _printable(item: Any) -> Any:
     return [_printable(value) for value in item] if isinstance(item, list | tuple) else item
 
 
-def warn_of_unusable(calibration: Path, record: Any) -> None:
-    """Say on standard error that a calibration did not converge, or ended with a residual that no arm has."""
-    if not record.converged or record.implausible_residual:
-        reason = "the residuals are too large for this arm; see aacmm show." if record.converged else record.reason
-        typer.echo(f"Warning: the calibration in {calibration} is not usable: {reason}", err=True)
+def warn_of_unusable(calibration: Path, record: Any, force: bool = True) -> None:
+    """Say on standard error that a calibration is not to be used, and why; without ``force``, refuse it."""
+    from ..diagnostics.usability import why_unusable
+
+    reason = why_unusable(record)
+    if reason is None:
+        return
+    if not force:
+        raise InputError(
+            f"the calibration in {calibration} is not usable: {reason}; calibrate again, or give --force to export it "
+            "all the same."
+        )
+    typer.echo(f"Warning: the calibration in {calibration} is not usable: {reason}.", err=True)

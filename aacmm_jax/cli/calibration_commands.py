@@ -181,7 +181,7 @@ def calibrate(
         if residuals is not None:
             options.write_residuals(residuals, record)
     show_summary(summary | {"written": str(output)}, as_json, views.calibration)
-    if not record.converged or not record.plausible_scale or record.implausible_residual or does_not_fit(record):
+    if any(row["severity"] == "unusable" for row in summary["findings"]) or does_not_fit(record):
         raise typer.Exit(1)
 
 

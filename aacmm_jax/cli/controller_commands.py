@@ -16,7 +16,7 @@ from ..files.outputs import check_kept, together, write_text
 from . import options
 from .app import command, show_summary, warn_of_unusable
 from .arm_command import first_frame
-from .options import argument, names_option, numbers_option, option, output
+from .options import argument, flag, names_option, numbers_option, option, output
 
 _FORMATS = {".urdf": "urdf", ".json": "json", ".csv": "csv", ".yaml": "ur", ".yml": "ur", ".py": "python"}
 _OF_ONE_ARM = ("toml", "urdf", "table", "ur", "python")
@@ -53,6 +53,7 @@ def export(
         "certificate (--format dcc).",
         "FILE.h5",
     ),
+    force: bool = flag("--force", "Export a calibration that is not usable all the same."),
 ) -> None:
     """Write a calibration for other programs or controllers."""
     written_as: str = form or _FORMATS.get("" if output is None else output.suffix.lower(), "toml")
@@ -75,7 +76,7 @@ def export(
                 f"{calibration} is not a calibration of simulated data, so it has no true arm; choose another value "
                 "for --arm."
             )
-        warn_of_unusable(calibration, record)
+        warn_of_unusable(calibration, record, force or which in ("nominal", "true"))
         if written_as == "dcc":
             text = _certificate(read, record, about, evaluation)
         elif written_as == "table":

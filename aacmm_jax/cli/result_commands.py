@@ -121,7 +121,7 @@ def evaluate(
         if residuals is not None:
             options.write_residuals(residuals, record)
     show_summary(summary, as_json, views.points if capture is None else views.evaluation)
-    if summary["failed"] or any(test["decision"] in ("fails", "undecided") for test in summary["acceptance"]):
+    if not summary["verdict"]["achieved"]:
         raise typer.Exit(1)
 
 

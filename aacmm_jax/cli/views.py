@@ -163,8 +163,10 @@ def calibration(summary: dict[str, Any]) -> View:
 
 
 def solve(summary: dict[str, Any]) -> Line:
-    """How the solve ended; a residual that no arm has is not called converged, whatever the solver says."""
+    """How the solve ended; a residual or a scale that no arm has is not called converged, whatever the solver says."""
     ended = Styled("converged", "green") if summary["converged"] else Styled("did not converge", "red")
+    if not summary["scale_plausible"]:
+        ended = Styled("ended with a scale that is not plausible", "red")
     if summary["converged"] and not summary["residual_plausible"]:
         ended = Styled("ended with residuals that are too large for this arm,", "red")
     rows = summary["observations"]  # with observations of other kinds, or a probe for each session: sockets too
@@ -224,11 +226,14 @@ def base(frames: Sequence[dict[str, Any]], factor: float) -> Table:
 def _uncertainty(summary: dict[str, Any]) -> View:
     """The expanded uncertainty over the volume, the noise that it follows from, and what the data determine."""
     part = summary["uncertainty"]
-    factors = ", ".join(filter(None, (LEVEL_IN_PERCENT, words.factor_words(part["volume"]))))
-    yield tables.volume_table(f"Expanded uncertainty U over the working volume ({factors}) [mm]", part["volume"])
+    regions = {"where poses were taken": part["where_poses_were_taken"], "over all joint limits": part["volume"]}
+    for region, volume in regions.items():
+        if volume is not None:
+            factors = ", ".join(filter(None, (LEVEL_IN_PERCENT, words.factor_words(volume))))
+            yield tables.volume_table(f"Expanded uncertainty U {region} ({factors}) [mm]", volume)
     yield (
-        "U is propagated from the uncertainties of the parameters to the tip positions of 400 random poses within the "
-        "joint limits."
+        "U is propagated from the uncertainties of the parameters to tip positions: those of poses of the calibration, "
+        "and those of 400 random poses within the joint limits."
     )
     if part.get("tried"):
         yield words.tried_sentence(part["tried"])

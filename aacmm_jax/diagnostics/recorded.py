@@ -21,7 +21,7 @@ from ..core.units import DEG, INCH, UM, M, length_unit
 from ..data.capture import Capture
 from ..data.observations.held import Socket
 from ..data.observations.measured import MeasuredTransforms
-from ..data.observations.observation import AbstractObservation
+from ..data.observations.observation import AbstractObservation, stated_u
 from ..data.recording import Recording
 from ..kinematics.arm import Arm, by_joint
 from ..kinematics.chain import reading_units
@@ -98,14 +98,7 @@ def _outside_limits(recording: Recording) -> Iterator[Finding]:
 def _implausible_uncertainties(capture: Capture) -> list[Finding]:
     """Of standard uncertainties that nothing which measures arms has: most likely of another unit than mm."""
     stated = [(f"[[length]] {length.start} - {length.end}", length.u) for length in capture.lengths]
-    for observation in capture.observations:
-        stored = observation.stored()
-        in_mm = any(entry.name == "u" and entry.unit == "mm" for entry in observation.entries)
-        u = stored.get("u") if in_mm else None
-        if stored.get("covariance") is not None:
-            u = np.sqrt(np.diagonal(np.asarray(stored["covariance"]), axis1=-2, axis2=-1))
-        if u is not None:
-            stated.append((f"[[{observation.table}]] {observation.name}", u))
+    stated += [(f"[[{part.table}]] {part.name}", stated_u(part)) for part in capture.observations]
     positive = [(where, values[values > 0]) for where, u in stated for values in [np.asarray(u, dtype=float).ravel()]]
     least = [(where, values.min() / UM) for where, values in positive if len(values) and values.min() < _SMALLEST_U]
     most = [(where, values.max() / UM) for where, values in positive if len(values) and values.max() > _LARGEST_U]

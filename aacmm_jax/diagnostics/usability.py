@@ -1,55 +1,51 @@
-"""Whether a result can be used at all: the solve ended at a minimum, with residuals that an arm can have."""
+"""Whether a result can be used at all: the solve ended at a minimum, with residuals that an arm can have.
+
+Where they are larger than usual, mistakes in the readings are looked for, as ``aacmm arm --check`` does. What was
+recorded is blamed only where that finds one; else the reason is what the residuals themselves show.
+"""
 
 import numpy as np
 
-from ..calibration.record import CalibrationRecord
+from ..calibration.record import SCALE_REFUSED, CalibrationRecord
 from ..calibration.results import active_names
+from ..core.errors import InputError
 from ..core.text import shorten
+from ..data.capture import draw_poses
 from ..kinematics.parameters import Parameters
+from .capture_check import check_capture
 from .contradictions import session_metrics
 from .equations import EXACT
-from .findings import Case, Finding
+from .findings import Case, Finding, findings_of
+from .missing_terms import missing
+from .noisy_encoders import noisiest_joint
+from .pose_residuals import distances_of
+from .reading_check import coupling_words, explanation_words
 from .recorded import likely_cause
+from .residual_tests import LEVEL
 
 ORDER, NEEDS = 10, "nothing"
 _APART = 5.0  # RMS of a session among others, over that which it has alone, beyond which they are not of one arm
 _TRY_ALL = "aacmm arm ARM --check MANIFEST tries every order and sign of the columns, and zero offsets of the joints."
+_CHECKED = 150  # poses, drawn at random: more only take longer
+_BETTER = 2.0  # the factor by which other readings must reduce the residual to be believed
+_MOST, _FEW = 0.5, 0.05  # part of the squared residuals that a few poses have, where they are the reason
 
 
 def test(case: Case) -> list[Finding]:
     """A solve that did not end, residuals that no arm has, and parameters most of which ended on a bound."""
     record, findings = case.record, []
-    # Where a solve ended whose scale is not plausible, that is what is wrong.
-    if not record.converged and (record.plausible_scale or not record.reason.startswith("Converged")):
+    if not record.converged and not record.reason.startswith(SCALE_REFUSED):  # that is said by another finding
         findings.append(Finding("not-converged", record.reason, severity="unusable"))
-    if record.implausible_residual:
-        if record.recording.capture.observations:
-            worst = int(np.argmax(record.observed.rms_after))
-            names, rms = (record.observed.names[worst],), record.observed.rms_after[worst]
-            subject = f"Poses of {names[0]} are {rms:.3g} mm RMS from their geometry"
-        else:
-            names, rms = (), float(record.evaluations()["calibrated"].repeatability.rms)
-            subject = f"The poses of a socket disagree by {rms:.3g} mm RMS"
-        findings.append(
-            Finding(
-                "implausible-residuals",
-                f"{subject}, but at most {record.largest_plausible_residual:.2g} mm is plausible for this arm, so "
-                "the data do not match the arm.",
-                advice=f"Check the columns, units, signs, sockets and the arm. {case.once(cause_or_check)}",
-                severity="unusable",
-                doubt="the data do not match the arm",
-                concerns=names,
-            )
-        )
+    if record.residual > record.largest_usual_residual:
+        findings.append(_of_residuals(case))
     elif record.plausible_scale and many_on_bounds(record):
-        sides = on_bounds(record)
+        sides, mistake = on_bounds(record), case.once(mistake_in_data)
         findings.append(
             Finding(
                 "many-on-bounds",
-                f"{len(sides)} of {len(record.names)} parameters are on a bound, so the data do not match the arm.",
-                advice=(
-                    f"Check the unit, the order of the columns, the sockets and the arm. {case.once(cause_or_check)}"
-                ),
+                f"{len(sides)} of {len(record.names)} parameters are on a bound, so either the bounds are too narrow, "
+                "or the data do not match the arm.",
+                advice=mistake or f"Widen the bounds (--length-bound-mm, --angle-bound-deg). {_TRY_ALL}",
                 severity="doubt",
                 doubt=f"on a bound: {shorten(sorted(sides), 3)}",
                 concerns=tuple(sides),
@@ -58,10 +54,84 @@ def test(case: Case) -> list[Finding]:
     return findings
 
 
-def cause_or_check(case: Case) -> str:
-    """The likely cause of data that do not fit; else what finds it."""
+def _of_residuals(case: Case) -> Finding:
+    """Residuals that are larger than usual: no arm has them, a mistake explains them, or the arm itself has them."""
+    record = case.record
+    if record.recording.capture.observations:
+        worst = int(np.argmax(record.observed.rms_after))
+        names, rms = (record.observed.names[worst],), record.observed.rms_after[worst]
+        subject = f"Poses of {names[0]} are {rms:.3g} mm RMS from their geometry"
+    else:
+        names, rms = (), float(record.evaluations()["calibrated"].repeatability.rms)
+        subject = f"The poses of a socket disagree by {rms:.3g} mm RMS"
+    largest, usual = record.largest_plausible_residual, record.largest_usual_residual
+    limit = f"at most {largest:.2g} mm is plausible" if record.implausible_residual else f"{usual:.2g} mm is usual"
+    finding = Finding(
+        "implausible-residuals", f"{subject}, but {limit} for this arm.", severity="unusable", concerns=names
+    )
+    if mistake := case.once(mistake_in_data):
+        says = f"{subject}, but {limit} for this arm, so the data do not match the arm."
+        advice = f"Check the columns, units, signs, sockets and the arm. {mistake}"
+        return finding._replace(says=says, advice=advice, doubt="the data do not match the arm")
+    reason = case.once(likely_reason)
+    finding = finding._replace(advice=f"Most likely: {reason}.")
+    if record.implausible_residual:
+        return finding._replace(doubt=f"residuals are too large for this arm; most likely {reason}")
+    return finding._replace(code="large-residuals", severity="doubt", doubt=f"large residuals, most likely {reason}")
+
+
+def mistake_in_data(case: Case) -> str:
+    """A mistake in what was recorded that explains residuals far better than the data as they are; else nothing."""
     recording = case.record.recording
-    return likely_cause(recording.nominal.arm, recording.capture) or _TRY_ALL
+    arm, capture = recording.nominal.arm, recording.capture
+    if cause := likely_cause(arm, capture):
+        return cause
+    if len(capture.readings) > _CHECKED:
+        capture = draw_poses(capture, _CHECKED)[0]
+    try:
+        check = check_capture(arm, capture)
+    except InputError:  # neither two poses in a socket nor measured points
+        return ""
+    if check.couplings:
+        return f"Likely cause: {coupling_words(check.couplings)}. {_TRY_ALL}"
+    given, best = check.given.rms_fitted, check.best.rms_fitted
+    if not check.explained or check.best == check.given or best * _BETTER > given:
+        return ""
+    return f"Likely cause: {explanation_words(check.best)}. {_TRY_ALL}"
+
+
+def likely_reason(case: Case) -> str:
+    """What residuals that are larger than usual, and that no mistake in the readings explains, most likely come from:
+    bounds, a few poses, one observation, one joint, bending, or play."""
+    record, capture = case.record, case.record.recording.capture
+    # Bounds that nobody stated were widened as far as that helped.
+    if (sides := on_bounds(record, final=True)) and "bounds" in record.recording.nominal.stated:
+        return f"bounds that are too narrow (reached: {shorten(sorted(sides), 3)})"
+    distances = distances_of(capture, record.evaluations()["calibrated"])
+    squares, names = [np.asarray(part) ** 2 for part in distances], [part.name for part in capture.parts]
+    total = sum(map(np.sum, squares))
+    worst = max(range(len(squares)), key=lambda i: squares[i].max(initial=0.0))
+    few = max(1, int(_FEW * sum(map(len, squares))))
+    if np.sort(np.concatenate(squares))[-few:].sum() > _MOST * total:
+        return f"errors of a few poses, the largest in {names[worst]} pose {int(np.argmax(squares[worst])) + 1}"
+    worst = max(range(len(squares)), key=lambda i: squares[i].sum())
+    if squares[worst].sum() > _MOST * total and len(squares[worst]) < _MOST * sum(map(len, squares)):
+        return f"errors in {names[worst]}"
+    if not record.implausible_residual:
+        # What equations linear in the residuals tell, which must be small for that.
+        noisiest = case.once(noisiest_joint)
+        joints = [encoder.joint for encoder in record.noisy_encoders]
+        joints += [noisiest.joint] if noisiest is not None and noisiest.probability < LEVEL else []
+        if joints:
+            return f"play or a loose encoder in joint {joints[0]}"
+        bending = [str(term.joint) for term in case.once(missing) if term.kind == "gravity"]
+        if bending:
+            return f"bending under gravity (joint {shorten(bending)})"
+        return "play in the joints, or another effect that the model does not describe"
+    return (
+        "another arm than the one named, rows that belong to other sockets or positions, or measured values that are "
+        "less certain than stated"
+    )
 
 
 def on_bounds(record: CalibrationRecord, final: bool = False) -> dict[str, str]:
@@ -78,6 +148,14 @@ def is_anchored(record: CalibrationRecord) -> bool:
 def many_on_bounds(record: CalibrationRecord) -> bool:
     """Whether so many parameters are on a bound that the arm is not that of the data."""
     return len(on_bounds(record)) >= len(record.names) / 3 and is_anchored(record)
+
+
+def why_unusable(record: CalibrationRecord) -> str | None:
+    """Why a calibration is not to be used, in a few words; None where it may be used."""
+    if record.converged and record.plausible_scale and record.residual <= record.largest_usual_residual:
+        return None
+    reasons = [finding.doubt or finding.says for finding in findings_of(record) if finding.severity == "unusable"]
+    return reasons[0].rstrip(".") if reasons else None
 
 
 def does_not_fit(record: CalibrationRecord) -> bool:

@@ -17,7 +17,7 @@ from ..kinematics.axes_to_dh import without_far_frames
 from ..kinematics.corrected_arm import loads_of
 from ..kinematics.independence import nearly_parallel
 from ..kinematics.parameters import ArmSpecification, single, with_tool
-from ..uncertainty.target_parameters import determined_parameters
+from ..uncertainty.target_parameters import determined_parameters, only_targets
 from .arm_tables import GEOMETRY, ArmFile, Identification, NoiseTable
 from .controllers import read_ur_kinematics
 from .outputs import as_path, storable, write_text
@@ -80,8 +80,9 @@ def load_specification(
     """The arm of a file with its name, its proposed identification and, of a URDF, what an export needs.
 
     A file without an ``[identification]`` table gets the parameters that thorough data would determine well, of
-    `Parameters.independent`, and the default bounds. ``source`` is, like all arguments that are not named here, that of
-    `load_arm`; ``probe`` is in mm.
+    `Parameters.independent`, and the default bounds. With a capture of targets alone, an arm that ships with the
+    package gets the parameters that this capture determines. ``source`` is, like all arguments that are not named here,
+    that of `load_arm`; ``probe`` is in mm.
 
     Args:
         capture: What was observed, where it is known.
@@ -94,7 +95,7 @@ def load_specification(
         ('alpha_1', 'alpha_2', 'a_1', 'a_2', 'theta_2', 'theta_3', 'beta_2', 'probe_x', 'probe_y')
     """
     specification, proposed = read_arm(source, base=base, tip=tip, probe=probe)
-    return specification if proposed else with_parameters(specification, capture)
+    return for_capture(specification, proposed, capture)
 
 
 def load_noise(source: str | os.PathLike, *, base: str | None = None, tip: str | None = None) -> ArmNoise:
@@ -255,14 +256,26 @@ def _arm_of_rows(model: ArmFile) -> Arm:
     return arm
 
 
+def for_capture(specification: ArmSpecification, proposed: bool, capture: Capture | None) -> ArmSpecification:
+    """The arm of a file with the parameters for a capture, where its file proposes none.
+
+    What the file of a shipped arm proposes is meant for its own probe, which is not what a capture of targets observes:
+    their places in the last frame are unknown, so that other parameters of the last joints are determined.
+    """
+    targets = capture is not None and only_targets(capture) and "parameters" not in specification.stated
+    return with_parameters(specification, capture) if targets or not proposed else specification
+
+
 def with_parameters(specification: ArmSpecification, capture: Capture | None = None) -> ArmSpecification:
-    """The same with the parameters for an arm whose file proposes none; by default for tips in sockets."""
+    """The same with the parameters that are determined; by default by tips in sockets."""
     try:
         space = determined_parameters(specification.arm, capture)
     except InputError:  # an arm of one or two joints, which has one configuration for each position of the tip
         return specification
     held = tuple(name for name in space.held if not name.startswith("beta_"))
-    return specification._replace(held=held, free=tuple(name for name in space.names if name.startswith("beta_")))
+    widths = {name: width for name, width in specification.override.items() if name in space.names}
+    free = tuple(name for name in space.names if name.startswith("beta_"))
+    return specification._replace(held=held, free=free, override=widths)
 
 
 def save_arm(arm: Arm, path: str | os.PathLike, *, name: str = "", source: str = "") -> None:

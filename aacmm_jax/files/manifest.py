@@ -18,7 +18,7 @@ from ..data.observations.held import Socket
 from ..data.recording import ProbedSphere, Recording, checked_sphere
 from ..kinematics.chain import beside_joints
 from ..kinematics.workspace import Reach
-from .arms import arm_beside, read_arm, usual_noise, with_parameters
+from .arms import arm_beside, for_capture, read_arm, usual_noise
 from .inputs import InputFile
 from .manifest_readings import Readings, points_of
 from .manifest_rows import Source, name_of, parts
@@ -97,7 +97,7 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
         check_readings(capture, nominal.arm)
         recording = Recording(
             capture,
-            nominal if proposed else with_parameters(nominal, capture),
+            for_capture(nominal, proposed, capture),
             spheres=spheres,
             sources=source.fingerprints(),
             measured=str(model.date or ""),

@@ -191,7 +191,7 @@ class _Reader:
         return TextTable(
             self._source.open(file),
             delimiter=table.delimiter,
-            decimal=table.decimal,
+            decimal=table.decimal or self._preset.decimal,
             skip=skip,
             wanted=wanted if self._own_file is None else (),
         )

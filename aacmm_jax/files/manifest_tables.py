@@ -30,6 +30,7 @@ from ..data.observations.observation import AbstractObservation, kinds
 from ..data.recording import SphereTest
 from ..kinematics.arm import Arm, by_joint
 from ..kinematics.correction_kinds import REFERENCE_TEMPERATURE
+from .table_columns import OF_UR
 from .text_lines import Column
 from .toml import Point, Strict, each_once
 
@@ -47,6 +48,7 @@ class Preset(NamedTuple):
     units: Mapping[str, str] = {}  # where neither the manifest nor the table's header states one
     rotation: str | None = None
     coverage_factor: float = 1.0
+    decimal: str | None = "."  # None: a comma where the table has one, but no point, between semicolons
 
 
 PRESETS = {
@@ -71,15 +73,21 @@ PRESETS = {
     ),
     # Point lists with the direction in which a point was probed, which is not needed.
     "xyzijk": Preset({"points": [["X", "Y", "Z"], [1, 2, 3]]}),
-    # christianlandgraf/ipa-robot-accuracy; R = Rx(rx) Ry(ry) Rz(rz) is the order that agrees with the robot's joints.
+    # christianlandgraf/ipa-robot-accuracy, its own files (semicolons, decimal commas) and tables with units in their
+    # names; R = Rx(rx) Ry(ry) Rz(rz) is the order that agrees with the robot's joints.
     "ipa": Preset(
         {
-            "points": [["x_mm", "y_mm", "z_mm"]],
-            "u": [["std_x_mm", "std_y_mm", "std_z_mm"]],
-            "rotations": [["rx_deg", "ry_deg", "rz_deg"]],
+            "q": [[f"{joint}_joint" for joint in OF_UR]],
+            "points": [["x_mm", "y_mm", "z_mm"], ["measurement_x", "measurement_y", "measurement_z"]],
+            "u": [
+                ["std_x_mm", "std_y_mm", "std_z_mm"],
+                ["measurement_std_x", "measurement_std_y", "measurement_std_z"],
+            ],
+            "rotations": [["rx_deg", "ry_deg", "rz_deg"], ["measurement_rx", "measurement_ry", "measurement_rz"]],
         },
         {"q": "rad", "rotations": "deg"},
         rotation="XYZ",
+        decimal=None,
     ),
 }
 
@@ -150,7 +158,7 @@ class Table(Strict):
     columns: Picked | dict[str, Picked] = Field(default_factory=dict)
     units: dict[str, str] = Field(default_factory=dict)
     delimiter: Literal[",", ";", "\t", " "] | None = None
-    decimal: Literal[".", ","] = "."
+    decimal: Literal[".", ","] | None = None  # None: that of the preset, else a point
     skip: NonNegativeInt = 0
     group: PositiveInt | str | None = None
     temperature_C: FiniteFloat | None = None  # of the arm, where the table has no such column

@@ -274,6 +274,7 @@ EVALUATION: Fields = {
     "used": text("sockets whose poses were used in the calibration"),
     "warnings": text("warnings about the results"),
     "calibration_warnings": text("warnings about the calibration"),
+    "calibration_unusable": text("why the calibration is not to be used, if it is not"),
     "maxima": mapping("largest permitted value of each metric, mm"),
     **JUDGED,
 }

@@ -26,7 +26,7 @@ _OF_OTHERS = re.compile(
 # First words in the names of columns that hold no reading.
 _NO_JOINT = re.compile("[xyzt]|time|timestamp|date|stamp|index|row|point|socket|group|name|nr|no")
 # Universal Robots' joints in ROS, whose messages have them in alphabetical order.
-_OF_UR = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+OF_UR = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 _POSITIONS = (("x", "y", "z"), ("px", "py", "pz"))
 TEMPERATURE = "temperature_C"  # the column of the arm's temperature
 TORQUE = "torque_{}_Nm"  # the columns of the joints' torques
@@ -121,8 +121,8 @@ def reading_columns(
             return free
     guess = [family.columns for family in families if family.whole]
     guess = [columns for columns in guess if all(_is_numeric(table, i) for i in columns)]
-    of_ur = [[i for i, name in enumerate(table.header) if joint in name.casefold()] for joint in _OF_UR]
-    if joints == len(_OF_UR) and all(len(columns) == 1 for columns in of_ur):
+    of_ur = [[i for i, name in enumerate(table.header) if joint in name.casefold()] for joint in OF_UR]
+    if joints == len(OF_UR) and all(len(columns) == 1 for columns in of_ur):
         guess = [[columns[0] for columns in of_ur]]
     proposed = guess[0] if guess else proposed_columns(table, joints, taken)
     add = f"add {stated_by(proposed)} if these columns are the readings of the joints in order"

@@ -53,7 +53,7 @@ def table_lines(path: str | os.PathLike) -> tuple[list[str], bool]:
     return lines, not lines[-1]
 
 
-def delimiter_of(lines: Sequence[str], decimal: str) -> str:
+def delimiter_of(lines: Sequence[str], decimal: str | None) -> str:
     """The delimiter of most of the last lines: semicolon, tab, comma (not with decimal commas), or a blank."""
     sample = [line for line in lines[: 4 * _SAMPLED] if line.strip(" \t") and not line.startswith("#")][:_SAMPLED]
     sample = sample[len(sample) // 2 :]  # lines before the table are first
@@ -62,6 +62,12 @@ def delimiter_of(lines: Sequence[str], decimal: str) -> str:
             return delimiter
     between_quotes = sum('",' in line or ',"' in line for line in sample)  # "27,392","46,043"
     return "," if 2 * between_quotes > len(sample) else " "
+
+
+def decimal_of(lines: Sequence[str], delimiter: str) -> str:
+    """The decimal mark of the last lines: a comma where they have commas, but no points, between other delimiters."""
+    sample = "".join(lines[-_SAMPLED:])
+    return "," if delimiter != "," and "," in sample and "." not in sample else "."
 
 
 def cells_of(line: str, delimiter: str, header: bool = False) -> list[str]:

@@ -16,6 +16,7 @@ from .text_lines import (
     Line,
     along_axes,
     cells_of,
+    decimal_of,
     delimiter_of,
     has_number,
     is_row,
@@ -40,9 +41,9 @@ class TextTable:
     A name that the header does not have exactly is compared without regard to case, blanks and a unit in brackets.
     A header is a line of words before the first row: none of them begins like a number.
 
-    ``delimiter`` is found where it is None; ``skip`` lines before the header are left out; of several lines of words,
-    the header is the one that has the columns that are ``wanted``. Raises `InputError` where the file is no text, its
-    rows differ in their number of columns, or several lines may be its header.
+    ``delimiter`` and ``decimal`` are found where they are None; ``skip`` lines before the header are left out; of
+    several lines of words, the header is the one that has the columns that are ``wanted``. Raises `InputError` where
+    the file is no text, its rows differ in their number of columns, or several lines may be its header.
     """
 
     def __init__(
@@ -50,15 +51,16 @@ class TextTable:
         path: str | os.PathLike,
         *,
         delimiter: str | None = None,
-        decimal: str = ".",
+        decimal: str | None = ".",
         skip: int = 0,
         wanted: Sequence[Column] = (),
     ):
-        self.path, self._decimal, self._hashes = path, decimal, False
+        self.path, self._hashes = path, False
         lines, self._ended = table_lines(path)
         if lines[skip : skip + 1] and (stated := re.fullmatch('"?sep=(.)"?', lines[skip])):  # of spreadsheets
             delimiter, skip = delimiter or stated[1], skip + 1
         delimiter = delimiter or delimiter_of(lines[skip:], decimal)
+        self._decimal = decimal or decimal_of(lines[skip:], delimiter)
         words: list[Line] = []
         comments: list[Line] = []
         rows: list[Line] = []

@@ -57,7 +57,7 @@ class JointKinds:
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class KnownFunctions:
-    """The functions of a chain's corrections, static in every program: which there are is in `corrections`.
+    """The functions of a chain's corrections, static in every program: which there are is in `correction_kinds`.
 
     A function of gravity is the product of the direction of gravity g with three rows,
 

@@ -30,6 +30,7 @@ from ..core.text import shorten
 from ..data.capture import Capture
 from ..data.recording import Recording
 from ..diagnostics.findings import findings_of, sentences
+from ..diagnostics.usability import why_unusable
 from ..kinematics.arm import Arm
 
 
@@ -116,6 +117,7 @@ def evaluate_capture(record: CalibrationRecord, recording: Recording, **options:
         standards=checked_standards(made_for if chosen.standards is None else chosen.standards),
         uncertainty=uncertainty_of(record),
         calibration_warnings=tuple(sentences(findings_of(record)) if noted is None else noted),
+        calibration_unusable=why_unusable(record),
         influences=chosen.influences,
         rule=chosen.rule,
     )
@@ -190,9 +192,8 @@ def _warnings(
     record: CalibrationRecord, recording: Recording, evaluation: EvaluationRecord, partly: Sequence[str]
 ) -> Iterator[str]:
     """What makes an evaluation doubtful; ``partly`` names what has poses that the calibration used, and others."""
-    if not record.converged or not record.plausible_scale:
-        reason = record.reason if not record.converged else f"k = {record.k:.6g} is not a plausible scale."
-        yield f"The calibration failed, so the results are meaningless: {reason}"
+    if evaluation.calibration_unusable:
+        yield f"The calibration is not usable, so the results are meaningless: {evaluation.calibration_unusable}."
     if recording.true is not None:
         yield SIMULATED
     yield from evaluation.recording.capture.repeated.sentences()

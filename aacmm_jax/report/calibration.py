@@ -25,6 +25,7 @@ from ..summaries.tables import (
     shared_sentence,
     two_digits,
 )
+from ..summaries.verdicts import length_uncertainty
 from ..uncertainty.coverage import LEVEL_IN_PERCENT
 from ..uncertainty.volume import volumetric_uncertainty
 from . import calibration_sections as sections
@@ -96,14 +97,9 @@ def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
     for row in summary["kinds"][:_MOST_KINDS]:
         title = f"RMS residual, {row['kind']}, nominal → calibrated"
         facts.append((title, changed(row["rms_before_mm"], row["rms_after_mm"])))
-    volume = summary["uncertainty"]["volume"]
-    length = f"U of a {volume['length_mm']:g} mm length with the noise of its readings"
-    largest, median = (volume[f"expanded_length_reading_{which}_mm"] for which in ("largest", "median"))
-    if median is not None and largest is not None:
-        typical, worst = (f"{two_digits(u)}\u00a0mm" for u in (median, largest))
-        facts.append((f"{length} ({LEVEL_IN_PERCENT})", f"median {typical}, largest {worst}"))
-    else:
-        facts.append((length, "not determined everywhere"))
+    stated = length_uncertainty(summary["uncertainty"])
+    length = f"{summary['uncertainty']['volume']['length_mm']:g} mm length with the noise of its readings"
+    facts.append((f"U of a {length} ({LEVEL_IN_PERCENT})", stated or "not determined everywhere"))
     if summary.get("lengths_tested"):
         facts.append(("Lengths tested", lengths_sentence(summary["lengths_tested"]).partition(": ")[2]))
     if summary["scale_k"] is not None:

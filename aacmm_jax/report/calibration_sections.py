@@ -137,7 +137,8 @@ def arm_in_poses(record: CalibrationRecord, evaluation: Evaluation) -> Section:
 
 def volume(volume: VolumetricUncertainty, summary: dict[str, Any]) -> Section:
     """Expanded uncertainty of tips and lengths over the working volume."""
-    statistics = summary["uncertainty"]["volume"]
+    statistics, taken = summary["uncertainty"]["volume"], summary["uncertainty"]["where_poses_were_taken"]
+    near = [] if taken is None else [volume_table("Expanded uncertainty where poses were taken [mm]", taken)]
     ends = zip("xyz", volume.start.min(axis=0), volume.start.max(axis=0), strict=True)
     box = ", ".join(f"{axis} from {low:.0f} to {high:.0f}" for axis, low, high in ends).replace("-", "−")
     introduction = (
@@ -152,8 +153,9 @@ def volume(volume: VolumetricUncertainty, summary: dict[str, Any]) -> Section:
     ):
         positions[name] = [with_u_digits(float(value)) for value in u]
     blocks = [
+        *near,
         introduction,
-        volume_table("Expanded uncertainty over the working volume [mm]", statistics),
+        volume_table("Expanded uncertainty over all joint limits [mm]", statistics),
         volume_chart(volume)._replace(table=by_columns("All positions", positions)),
         noise_sentence(summary),
     ]

@@ -1,5 +1,6 @@
 """Arms, captures and calibrations as plain dictionaries with the unit in every key; ``--json`` prints them."""
 
+import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,6 +11,7 @@ from ..calibration.agreement import Agreement, CrossValidation
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import PriorMetrics
+from ..core.errors import InputError
 from ..core.text import csv_text, pluralise
 from ..core.units import ARCSEC, people_read
 from ..data.capture import Capture, ReferenceLength
@@ -216,7 +218,7 @@ def calibration_summary(record: CalibrationRecord, volume: VolumetricUncertainty
             summary["truth"][stage] = truth
     held_out = summary["cross_validation"]
     summary["lengths_tested"] = checked_lengths(summary["lengths"], held_out, record.fixed_by_one_length)
-    verdict = calibration_verdict(findings, summary["uncertainty"]["volume"], held_out, "truth" in summary)
+    verdict = calibration_verdict(findings, summary["uncertainty"], held_out, "truth" in summary)
     return summary | {"verdict": verdict._asdict()}
 
 
@@ -228,7 +230,9 @@ def _uncertainty_summary(record: CalibrationRecord, volume: VolumetricUncertaint
     if len(readings) > 1:  # a single pose has no distance from another
         poses = tried_poses(record.calibrated.arm, readings, volume.q)
         nearby = {"poses": len(poses.distance), "tried": int(poses.tried.sum()), "spacing_rad": poses.spacing}
-    pairs = uncertainty.correlated(_CORRELATED)
+    pairs, near = uncertainty.correlated(_CORRELATED), None
+    with contextlib.suppress(InputError):  # where no two poses are as far apart as the length
+        near = volumetric_uncertainty(uncertainty, length=volume.length, near=readings).summary
     for encoder in record.noisy_encoders:
         unit, size = ("mm", 1.0) if encoder.joint in record.calibrated.arm.prismatic else ("arcsec", ARCSEC)
         values = {name: getattr(encoder, name) / size for name in ("expected", "found", "u")}
@@ -242,6 +246,7 @@ def _uncertainty_summary(record: CalibrationRecord, volume: VolumetricUncertaint
         # Of the unknown geometry, whose uncertainty follows from the scatter of single poses.
         "coverage_factor_geometry_95": float(uncertainty.expanded_by_scatter(np.ones(1), np.zeros(1))[0]),
         "volume": plain(volume.summary),
+        "where_poses_were_taken": plain(near),
         "correlated": [{"one": first, "other": second, "r": r} for first, second, r in pairs],
         **attributes(observability, "rank", "condition", "indices"),
         "parameters": len(observability.names),

@@ -47,6 +47,7 @@ def evaluation_summary(
         "kind": "evaluation",
         "arm": record.recording.nominal.name,
         "warnings": list(record.warnings),
+        "calibration_unusable": record.calibration_unusable,
     }
     whole = _evaluated(record, capture)
     rows = metrics_by_socket_and_length(capture, whole["calibrated"])
@@ -148,12 +149,15 @@ def _add_prediction(
             {"group": label, "members": list(names)} | agreement_row(compared.of(names))
             for label, names in zip(common_labels(groups_of(part)), groups_of(part), strict=True)
         ]
+    unexpected = NOTHING  # lengths that are all within their U are as expected, however they lie within it
     if lengths:
         errors = compared if compared is not None and part is capture else unseen_errors(record.uncertainty, capture)
         of_lengths, expanded = errors.of_lengths(lengths), plain(errors.expanded())
         for row, i in zip(group["lengths"], lengths, strict=True):
             row["expanded_mm"] = expanded[i]
             row["error_over_expanded"] = plain(row["error_mm"] / expanded[i]) if expanded[i] else None
+        if any(abs(row["error_over_expanded"] or 0.0) > 1 for row in group["lengths"]):
+            unexpected = of_lengths
     group["predicted"] = {
         "poses": agreement_row(poses),
         "lengths": {
@@ -163,7 +167,7 @@ def _add_prediction(
         },
     }
     before, after = (group[stage].get("observed_rms_mm", group[stage].get("rms_mm")) for stage in record.arms())
-    unseen = surprise(poses, of_lengths, by_name, lambda: _with_probe_fitted(record.uncertainty, part))
+    unseen = surprise(poses, unexpected, by_name, lambda: _with_probe_fitted(record.uncertainty, part))
     return sentences(unseen + no_better(before, after))
 
 

@@ -15,33 +15,35 @@ from .tables import two_digits
 
 _LACKING = "the residuals show errors that the model does not describe"  # what tests of residuals doubt
 _LARGER = 1.25  # times what is predicted: less is as good as predicted
+# A prediction so many times what was found is of no use, and what is found so many times the prediction refutes it,
+# whatever the number of degrees of freedom. A single length is so near its value by chance in 8 of 100 cases.
+_FAR, _FEWEST_LENGTHS = 10.0, 2
+_WORSE = 2.0  # times the errors of lengths by the nominal arm: the calibration made them worse
 
 
 class Verdict(NamedTuple):
-    """A mark and a sentence."""
+    """A mark and a sentence, and whether the result is what was asked for: else commands end with exit code 1."""
 
     mark: str
     says: str
+    achieved: bool = True
 
 
 def calibration_verdict(
-    findings: Sequence[Finding], volume: Mapping[str, Any], held_out: Mapping[str, Any] | None, simulated: bool
+    findings: Sequence[Finding], uncertainty: Mapping[str, Any], held_out: Mapping[str, Any] | None, simulated: bool
 ) -> Verdict:
-    """Of a calibration: by its findings, the most serious first, and by the uncertainty over the working volume and the
-    cross-validation of its summary."""
+    """Of a calibration: by its findings, the most serious first, and by the uncertainty and the cross-validation of its
+    summary."""
     unusable = [finding for finding in findings if finding.severity == "unusable"]
     if unusable:
         says = unusable[0].doubt
-        return Verdict("bad", f"Not usable: {says}." if says else f"Not usable. {unusable[0].says}")
+        return Verdict("bad", f"Not usable: {says}." if says else f"Not usable. {unusable[0].says}", False)
     doubts = list(dict.fromkeys(finding.doubt or _LACKING for finding in findings if finding.severity == "doubt"))
-    median, largest = (volume[f"expanded_length_reading_{which}_mm"] for which in ("median", "largest"))
-    if median is None or largest is None:
+    values, length = length_uncertainty(uncertainty), uncertainty["volume"]["length_mm"]
+    stated = f"{U_AT_LEVEL} of a measured length of {length:g} mm is {values}"
+    if values is None:
         doubts = ["the data do not determine lengths everywhere in the working volume", *doubts]
         return Verdict("unsure", f"To be used with care: {'; '.join(doubts)}.")
-    stated = (
-        f"{U_AT_LEVEL} of a measured length of {volume['length_mm']:g} mm is {two_digits(median)} mm (at worst "
-        f"{two_digits(largest)} mm)"
-    )
     if doubts:
         says = f"To be used with care: {'; '.join(doubts)}, so errors may exceed the stated uncertainty. {stated}."
         return Verdict("unsure", says)
@@ -49,6 +51,22 @@ def calibration_verdict(
     checked = "held-out data agree with this U" if agrees else "no held-out data confirm this U"
     prefix = "Calibrated, in simulation" if simulated else "Calibrated"
     return Verdict("good" if agrees else "neutral", f"{prefix}: {stated}; {checked}.")
+
+
+def length_uncertainty(uncertainty: Mapping[str, Any]) -> str | None:
+    """U of a measured length, where poses were taken and over all joint limits, of the summary of an uncertainty: its
+    median and, over all limits, its largest value; None where the data do not determine lengths."""
+    volume, near = uncertainty["volume"], uncertainty.get("where_poses_were_taken")
+
+    def of(region: Mapping[str, Any] | None, which: str) -> str | None:
+        value = None if region is None else region[f"expanded_length_reading_{which}_mm"]
+        return None if value is None else f"{two_digits(value)} mm"
+
+    median, largest, taken = of(volume, "median"), of(volume, "largest"), of(near, "median")
+    if median is None or largest is None:
+        return None
+    everywhere = f"{median} over all joint limits (at worst {largest})"
+    return everywhere if taken is None else f"{taken} where poses were taken, {everywhere}"
 
 
 def checked_lengths(
@@ -95,9 +113,12 @@ def evaluation_verdict(summary: Mapping[str, Any], own_warnings: int = 0) -> Ver
     if decision == "fails":
         failed = (sentence.rstrip(".") for sentence in summary["failed"])
         reasons = [*(f"{name} is over its limit" for name in names), *failed]
-        return Verdict("bad", f"Fails: {shorten(reasons, 3)}.")
+        return Verdict("bad", f"Fails: {shorten(reasons, 3)}.", False)
+    if unusable := summary.get("calibration_unusable"):
+        return Verdict("bad", f"Not usable, because the calibration is not: {unusable}.", False)
     if decision == "undecided":
-        return Verdict("unsure", f"Undecided: the measurement is too uncertain for a decision on {shorten(names)}.")
+        says = f"Undecided: the measurement is too uncertain for a decision on {shorten(names)}."
+        return Verdict("unsure", says, False)
     if decision == "conforms":
         incomplete = any(test["missing"] for test in summary["acceptance"] if test["decision"])
         without = dict.fromkeys(metric["name"] for metric in metrics if metric["decision"] is None)
@@ -111,24 +132,41 @@ def evaluation_verdict(summary: Mapping[str, Any], own_warnings: int = 0) -> Ver
         return Verdict("unsure" if incomplete or own_warnings else "good", says)
     if summary.get("held_out") is None:
         return Verdict("neutral", "Measured; no limit was given.")
-    return _as_predicted(summary["held_out"].get("predicted") or {"poses": {}, "lengths": {}})
+    return _as_predicted(summary["held_out"])
 
 
-def _as_predicted(predicted: Mapping[str, Any]) -> Verdict:
-    """Of errors on held-out data, which no limit was given for."""
-    poses = predicted["poses"]
+def _as_predicted(held_out: Mapping[str, Any]) -> Verdict:
+    """Of errors on held-out data, which no limit was given for.
+
+    Lengths that are all within their U raise no doubt, however their errors are distributed within it.
+    """
+    predicted = held_out.get("predicted") or {"poses": {}, "lengths": {}}
+    of_lengths, rows = predicted["lengths"], held_out.get("lengths", [])
+    over = [row["error_over_expanded"] for row in rows if row.get("error_over_expanded") is not None]
+    beyond = any(abs(value) > 1 for value in over)
+    errors = [held_out.get(stage, {}).get("length_error_mean_absolute_mm") for stage in ("nominal", "calibrated")]
+    if errors[0] and errors[1] and errors[1] > _WORSE * errors[0] and (beyond or not over):
+        says = f"their errors ({errors[1]:.3g} mm on average) are {errors[1] / errors[0]:.2g} times as large"
+        return Verdict("bad", f"Held-out lengths are worse than with the nominal arm: {says}.", False)
+    poses, ratio = predicted["poses"], of_lengths.get("normalised_error_rms")
     if poses.get("rms_mm") is None or poses.get("rms_predicted_mm") is None:
         return Verdict("neutral", "Measured on held-out data; no limit was given.")
     measured, expected = poses["rms_mm"], poses["rms_predicted_mm"]
-    chances = [row["probability"] for row in (poses, predicted["lengths"]) if row["probability"] is not None]
     rms = f"held-out poses deviate by {measured:.3g} mm RMS from their geometry, where {expected:.3g} mm was predicted"
-    ratio = predicted["lengths"]["normalised_error_rms"]
     if ratio is not None:
         rms += f", and length errors are {ratio:.2g} times as large as predicted"
-    if any(chance < SIGNIFICANCE / len(chances) for chance in chances):
-        chance = min(chances)
-        return Verdict("unsure", f"Errors on held-out data exceed the prediction (p = {chance:.1g}): {rms}.")
-    if max(measured / expected if expected else 0.0, ratio or 0.0) > _LARGER:
+        rms += ", but within U" if ratio > 1 and not beyond else ""
+    chances = [row.get("probability") for row in (poses, *([of_lengths] if beyond else []))]
+    chances = [chance for chance in chances if chance is not None]
+    larger = max(measured / expected if expected else 0.0, ratio if ratio and beyond else 0.0)
+    if larger > _FAR or any(chance < SIGNIFICANCE / len(chances) for chance in chances):
+        by_chance = f" (p = {min(chances):.1g})" if chances else ""
+        return Verdict("unsure", f"Errors on held-out data exceed the prediction{by_chance}: {rms}.", False)
+    few = of_lengths.get("lengths", 0) < _FEWEST_LENGTHS
+    if expected >= _FAR * measured or (ratio is not None and ratio <= 1 / _FAR and not few):
+        says = f"the prediction is over {_FAR:g} times what was found, so it is of no use here: {rms}"
+        return Verdict("unsure", f"Not confirmed: {says}.", False)
+    if larger > _LARGER:
         return Verdict("unsure", f"Errors on held-out data are larger than predicted, but this may be chance: {rms}.")
     return Verdict(
         "neutral",

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.arguments import checked_arguments
+from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
 from ..core.random_keys import random_generator
@@ -15,6 +16,9 @@ from ..kinematics.inverse_kinematics import project_to_targets
 from ..kinematics.workspace import total_link_length
 from .arm_uncertainty import Uncertainty
 
+_PAIRS = 20_000  # of poses that are drawn, to find those whose tips are about a length apart
+_MOVED = 1 / 3  # of the length: by so much more or less may they be
+_FEW = 50  # lengths: fewer do not show a median and a largest value
 _LENGTH_MM = 300.0  # lengths of the map, where none is given: those of the paper's checks
 
 
@@ -63,22 +67,32 @@ class VolumetricUncertainty(NamedTuple):
 
 @checked_arguments
 def volumetric_uncertainty(
-    uncertainty: Uncertainty, *, points: int = 400, length: float | None = None, limits: Any = None, seed: int = 0
+    uncertainty: Uncertainty,
+    *,
+    points: int = 400,
+    length: float | None = None,
+    limits: Any = None,
+    near: Numbers | None = None,
+    seed: int = 0,
 ) -> VolumetricUncertainty:
-    """Uncertainty of tips and of lengths over the reachable volume; its points are the tips of random poses.
+    """Uncertainty of tips and of lengths over the reachable volume, or near to some poses.
+
+    Its points are the tips of random poses, or of some of these poses.
 
     Args:
         uncertainty: of a calibrated arm.
         points: number of points.
         length: size of the lengths, mm; by default 300, or half the sum of a small arm's links.
         limits: lowest and highest reading of each joint ``(n, 2)``, rad; by default the arm's own.
+        near: poses ``(N, n)``, rad, such as those of a calibration, near which the lengths begin and end; by default
+            these are anywhere within the limits.
         seed: of the random numbers.
 
     Returns:
-        Uncertainties at every point, mm.
+        Uncertainties at every point, mm; near to poses, at as many points as there are such lengths.
 
     Raises:
-        InputError: no length of this size can be placed within the joint limits.
+        InputError: no length of this size can be placed within the joint limits, or near to the poses.
 
     Example:
         >>> volume = aj.volumetric_uncertainty(aj.uncertainty_of(result), points=20, length=300.0)
@@ -86,7 +100,10 @@ def volumetric_uncertainty(
         u of 300 mm: 0.012 mm, at most 0.031 mm
     """
     length = default_length(uncertainty.arm) if length is None else length
-    start, end = sample_lengths(uncertainty.arm, points, length=length, limits=limits, seed=seed)
+    if near is None:
+        start, end = sample_lengths(uncertainty.arm, points, length=length, limits=limits, seed=seed)
+    else:
+        start, end = lengths_between(uncertainty.arm, near, points, length=length, limits=limits, seed=seed)
     tips, *parts = _volume(to_numpy(uncertainty), start, end)
     u = [np.sqrt(np.sum(np.asarray(part), axis=-1)) for part in parts]
     expanded = [uncertainty.expanded_by_parts(part) for part in parts]
@@ -153,3 +170,26 @@ def sample_lengths(
         if sum(map(len, starts)) >= count:
             return np.concatenate(starts)[:count], np.concatenate(ends)[:count]
     raise InputError(f"this arm cannot reach lengths of {length:g} mm within its joint limits; give a shorter length.")
+
+
+def lengths_between(
+    arm: Arm, poses: Numbers, count: int, *, length: float, limits: Any = None, seed: int = 0
+) -> tuple[Float[np.ndarray, "v n"], Float[np.ndarray, "v n"]]:
+    """Lengths that begin in one of these poses ``(N, n)``, rad, and end near to another, whose tip is moved along the
+    line between both tips until they are so far apart, by at most a third of the length: at most ``count`` of them.
+    `InputError` where hardly any two poses are that far apart."""
+    q, random = np.asarray(poses, dtype=float)[:, : arm.joints], random_generator(seed)
+    tips = np.asarray(arm.position(q))
+    first, second = random.integers(len(q), size=(2, _PAIRS))
+    between = tips[second] - tips[first]
+    apart = np.linalg.norm(between, axis=1)
+    chosen = np.flatnonzero(np.abs(apart - length) < length * _MOVED)[:count]
+    first, second, direction = first[chosen], second[chosen], between[chosen] / apart[chosen, None]
+    allowed = np.asarray(joint_limits(arm, None if limits is None else np.asarray(limits).tolist()))
+    end, arrived = project_to_targets(arm, q[second], tips[first] + length * direction, allowed)
+    if arrived.sum() < min(count, _FEW):
+        raise InputError(
+            f"hardly any two of these poses have tips about {length:g} mm apart; give poses all over the volume, or "
+            "another length."
+        )
+    return q[first][arrived], end[arrived]

@@ -251,7 +251,7 @@ def test_uncertainties_are_printed(aacmm):
     assert summary["cross_validation"]["excess"] < 2.5
     shown = " ".join(aacmm("show", "c.h5").stdout.split())
     assert shown.index("Cross-validation: each") < shown.index("Errors in the poses used for identification")
-    assert "Expanded uncertainty U over the working volume (95 %, coverage factor 1.96)" in shown
+    assert "Expanded uncertainty U over all joint limits (95 %, coverage factor 1.96)" in shown
     assert "Observability: rank 21 of 21" in shown
 
 
@@ -378,6 +378,15 @@ def test_data_of_another_arm_are_no_calibration(aacmm, tmp_path, noisy_capture, 
     aj.files.save_capture(tmp_path / "c.h5", Recording(capture, nominal))
     shown = aacmm("calibrate", "c.h5", "-o", "k.h5", expect=1).stdout
     assert f"Likely cause: {cause}" in " ".join(shown.split())
+    evaluated = aacmm("evaluate", "k.h5", "c.h5", "--json", expect=1).stdout
+    says = "Not usable, because the calibration is not: the data do not match the arm."
+    assert json.loads(evaluated)["verdict"] == {"mark": "bad", "says": says, "achieved": False}
+    refused = " ".join(aacmm("export", "k.h5", "-o", "arm.toml", expect=2).stderr.split())
+    assert "not usable: the data do not match the arm; calibrate again, or give --force" in refused
+    assert not (tmp_path / "arm.toml").exists()
+    aacmm("export", "k.h5", "-o", "nominal.toml", "--arm", "nominal")
+    assert "not usable" in aacmm("export", "k.h5", "-o", "arm.toml", "--force").stderr
+    assert (tmp_path / "arm.toml").exists()
 
 
 @pytest.mark.slow

@@ -150,16 +150,18 @@ def test_a_residual_that_no_arm_has_is_not_called_converged():
 
 
 @pytest.mark.parametrize(
-    ("converged", "plausible", "said", "unsaid"),
+    ("converged", "plausible", "scale", "said", "unsaid"),
     [
-        (True, True, ": converged in 3 steps", "no arm has"),
-        (True, False, "ended with residuals that are too large for this arm, in 3 steps", "converged"),
-        (False, False, "did not converge in 3 steps", "no arm has"),
+        (True, True, True, ": converged in 3 steps", "no arm has"),
+        (True, False, True, "ended with residuals that are too large for this arm, in 3 steps", "converged"),
+        (False, False, True, "did not converge in 3 steps", "no arm has"),
+        (False, True, False, "ended with a scale that is not plausible in 3 steps", "converge"),
     ],
 )
-def test_verdict(capsys, converged, plausible, said, unsaid):
+def test_verdict(capsys, converged, plausible, scale, said, unsaid):
     summary = {"arm": "arm", "method": "joint", "steps": 3, "poses": 9, "sockets_used": ["A"], "observations": []}
-    display([views.solve(summary | {"converged": converged, "residual_plausible": plausible})])
+    summary |= {"converged": converged, "residual_plausible": plausible, "scale_plausible": scale}
+    display([views.solve(summary)])
     shown = " ".join(capsys.readouterr().out.split())
     assert said in shown
     assert unsaid not in shown

@@ -276,3 +276,18 @@ def test_a_file_without_identification_gets_independent_parameters(tmp_path):
     aj.files.save_arm(specification.arm, path)  # a file of the arm alone proposes nothing
     assert "identification" not in path.read_text()
     assert aj.files.load_specification(path).space().names == chosen.names
+
+
+@pytest.mark.parametrize("target", ["reflector", ""])
+def test_the_parameters_of_a_shipped_arm_are_for_its_own_probe(target):
+    """Of targets alone theta_6 and alpha_6 of panda are determined, and its probe is not."""
+    arm, random = aj.load_arm("panda"), np.random.default_rng(1)
+    q = random.uniform(-1.5, 1.5, (40, 7))
+    seen = np.asarray(arm.replace(probe=[80.0, 30.0, 50.0]).position(q))
+    points = aj.data.observations.MeasuredPoints("tracker", q, seen, u=0.02, target=target)
+    specification = aj.files.load_specification("panda", capture=aj.Capture({}, [], [points]))
+    names = specification.space().names
+    assert ("theta_6" in names) == ("alpha_6" in names) == bool(target)
+    assert ("probe_x" in names) == (not target)
+    assert set(specification.override) <= set(names)
+    assert len(specification.bounds().lower) == len(names)

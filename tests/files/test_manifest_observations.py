@@ -342,6 +342,22 @@ def test_the_robot_of_the_examples(mukca):
     assert one.q.shape == (2772, 6)
 
 
+@pytest.mark.parametrize("mark", [",", "."])
+def test_the_robots_own_files(tmp_path, mark):
+    """As their authors published them: semicolons and decimal commas, standard deviations beside each coordinate."""
+    joints = ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"]
+    measured = [f"measurement_{kind}{axis}" for axis in "xyz" for kind in ("", "std_")]
+    header = ["Timestamp", "Goal x", *(f"{joint}_joint" for joint in joints), "measurement_temperature", *measured]
+    rows = [[2.02011e13, 0.1, *Q[i], 21.68, *np.stack([P[i], U[i]], axis=1).ravel()] for i in range(5)]
+    lines = [";".join(header), *(";".join(map(repr, map(float, row))).replace(".", mark) for row in rows)]
+    (tmp_path / "c.csv").write_text("\n".join(lines) + "\n")
+    (tmp_path / "capture.toml").write_text('arm = "ur10"\n[[points]]\nfile = "c.csv"\npreset = "ipa"\n')
+    (seen,) = aj.files.read_manifest(tmp_path / "capture.toml").capture.observations
+    assert np.array_equal(seen.q, Q)
+    assert np.array_equal(seen.points, P)
+    assert np.allclose(np.sqrt(np.einsum("mii->mi", seen.covariance)), U)
+
+
 def test_sessions_of_tables_and_of_rows(tmp_path):
     """As `join_sessions` makes them; a probe each, unless the manifest says otherwise."""
     for day in ("monday", "tuesday"):

@@ -219,7 +219,7 @@ def test_numbers_of_a_report_are_under_the_right_heading(written):
         if row[parameters.columns.index("U (95 %)")].value is not None:
             assert row[parameters.columns.index("U (95 %)")].value == pytest.approx(scale * expanded[i])
     volume = aj.volumetric_uncertainty(aj.uncertainty_of(record))
-    rows = tables["Expanded uncertainty over the working volume [mm]"].rows
+    rows = tables["Expanded uncertainty over all joint limits [mm]"].rows
     assert rows[1][3].value == pytest.approx(volume.expanded_length.max())
     positions = tables["All positions"]
     np.testing.assert_allclose([row[4].value for row in positions.rows], volume.expanded_length)

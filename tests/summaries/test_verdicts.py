@@ -11,6 +11,8 @@ from aacmm_jax.summaries.verdicts import (
 )
 
 VOLUME = {"length_mm": 300.0, "expanded_length_reading_median_mm": 0.02, "expanded_length_reading_largest_mm": 0.1}
+NEAR = VOLUME | {"expanded_length_reading_median_mm": 0.011, "expanded_length_reading_largest_mm": 0.03}
+U = {"volume": VOLUME, "where_poses_were_taken": NEAR}
 HELD_OUT_RMS = {"rms_mm": 0.1}
 
 
@@ -25,8 +27,8 @@ def finding(severity, doubt="", says="Something was found."):
             [],
             HELD_OUT_RMS,
             "good",
-            "Calibrated: U (95 %) of a measured length of 300 mm is 0.020 mm (at worst 0.10 mm); held-out data agree "
-            "with this U.",
+            "Calibrated: U (95 %) of a measured length of 300 mm is 0.011 mm where poses were taken, 0.020 mm over all "
+            "joint limits (at worst 0.10 mm); held-out data agree with this U.",
         ),
         ([], None, "neutral", "no held-out data confirm this U"),
         ([finding("note")], HELD_OUT_RMS, "good", "Calibrated: U (95 %)"),
@@ -52,18 +54,22 @@ def finding(severity, doubt="", says="Something was found."):
     ],
 )
 def test_of_a_calibration(findings, held_out, mark, says):
-    verdict = calibration_verdict(findings, VOLUME, held_out, simulated=False)
+    verdict = calibration_verdict(findings, U, held_out, simulated=False)
     assert verdict.mark == mark
+    assert verdict.achieved == (mark != "bad")
     assert says in verdict.says
 
 
 def test_of_a_simulation_and_of_what_is_not_determined():
-    assert calibration_verdict([], VOLUME, None, simulated=True).says.startswith("Calibrated, in simulation: U (95 %)")
-    unknown = VOLUME | {"expanded_length_reading_largest_mm": None}
+    assert calibration_verdict([], U, None, simulated=True).says.startswith("Calibrated, in simulation: U (95 %)")
+    nowhere_near = calibration_verdict([], U | {"where_poses_were_taken": None}, None, simulated=False)
+    assert "of 300 mm is 0.020 mm over all joint limits (at worst 0.10 mm)" in nowhere_near.says
+    unknown = U | {"volume": VOLUME | {"expanded_length_reading_largest_mm": None}}
     verdict = calibration_verdict([], unknown, HELD_OUT_RMS, simulated=False)
     assert verdict == (
         "unsure",
         "To be used with care: the data do not determine lengths everywhere in the working volume.",
+        True,
     )
 
 
@@ -75,9 +81,59 @@ def evaluated(*decisions, missing=(), found=None, **more):
     return {"acceptance": [test], "failed": [], "kept": [], "held_out": None} | more
 
 
-def held_out(probability, predicted=0.1):
-    poses = {"rms_mm": 0.2, "rms_predicted_mm": predicted, "probability": probability}
-    return {"predicted": {"poses": poses, "lengths": {"probability": None, "normalised_error_rms": 0.7}}}
+def held_out(probability, predicted=0.1, found=0.2, ratio=0.7, over=(), count=2, of_lengths=None, errors=(0.5, 0.1)):
+    """Poses, and lengths: the ratio of their errors to what is predicted, and the errors over U of each."""
+    poses = {"rms_mm": found, "rms_predicted_mm": predicted, "probability": probability}
+    lengths = {"lengths": count, "probability": of_lengths, "normalised_error_rms": ratio}
+    stages = dict(zip(("nominal", "calibrated"), ({"length_error_mean_absolute_mm": x} for x in errors), strict=True))
+    rows = [{"error_over_expanded": value} for value in over]
+    return {"predicted": {"poses": poses, "lengths": lengths}, "lengths": rows, **stages}
+
+
+_WORSE = "Held-out lengths are worse than with the nominal arm: their errors (0.5 mm on average) are 5 times as large"
+_OVER = "Errors on held-out data exceed the prediction"
+_CHANCE = "Errors on held-out data are larger than predicted, but this may be chance"
+_EXPECTED = "Errors on held-out data are about as predicted, or smaller"
+
+
+@pytest.mark.parametrize(
+    ("summary", "mark", "begins", "code"),
+    [
+        (evaluated("conforms"), "good", "Conforms", 0),
+        (evaluated("undecided"), "unsure", "Undecided", 1),
+        (evaluated("fails"), "bad", "Fails", 1),
+        (evaluated("fails", calibration_unusable="x"), "bad", "Fails", 1),
+        # Whatever the errors are, a calibration that is not usable does not hold.
+        (evaluated("conforms", calibration_unusable="it stopped"), "bad", "Not usable, because the calibration is", 1),
+        (evaluated(held_out=held_out(0.9), calibration_unusable="it stopped"), "bad", "Not usable, because the", 1),
+        (evaluated(), "neutral", "Measured; no limit was given.", 0),
+        (evaluated(held_out=held_out(0.9, 0.2)), "neutral", _EXPECTED, 0),
+        (evaluated(held_out=held_out(0.001)), "unsure", f"{_OVER} (p = 0.001)", 1),
+        (evaluated(held_out=held_out(0.2, 0.1)), "unsure", _CHANCE, 0),
+        (evaluated(held_out=held_out(0.2, 0.019)), "unsure", _OVER, 1),  # ten times the prediction: no chance
+        # "1.67 mm, predicted 432 mm"
+        (evaluated(held_out=held_out(1.0, 432.0, 1.67)), "unsure", "Not confirmed: the prediction is over 10", 1),
+        (evaluated(held_out=held_out(0.9, 0.2, ratio=0.05)), "unsure", "Not confirmed", 1),
+        (evaluated(held_out=held_out(0.9, 0.2, ratio=0.05, count=1)), "neutral", _EXPECTED, 0),
+        # "the lengths are 170 times worse"
+        (evaluated(held_out=held_out(0.5, 0.2, ratio=170.0, over=[85.0], count=1)), "unsure", _OVER, 1),
+        (evaluated(held_out=held_out(0.5, 0.2, over=[1.2], errors=(0.1, 0.5))), "bad", _WORSE, 1),
+        (evaluated(held_out=held_out(0.5, 0.2, over=[0.9], errors=(0.1, 0.5))), "neutral", _EXPECTED, 0),
+        # RMS 0.0162 where 0.0170 was predicted, with lengths within their U
+        (
+            evaluated(held_out=held_out(0.6, 0.0170, 0.0162, 1.5, [0.7, -0.8], of_lengths=0.004)),
+            "neutral",
+            _EXPECTED,
+            0,
+        ),
+        (evaluated(held_out=held_out(0.6, 0.0170, 0.0162, 1.5, [0.7, -1.1], of_lengths=0.2)), "unsure", _CHANCE, 0),
+        (evaluated(held_out=held_out(0.6, 0.0170, 0.0162, 2.5, [1.7, -0.8], of_lengths=0.004)), "unsure", _OVER, 1),
+    ],
+)
+def test_situations(summary, mark, begins, code):
+    verdict = evaluation_verdict(summary)
+    assert (verdict.mark, int(not verdict.achieved)) == (mark, code), verdict.says
+    assert verdict.says.startswith(begins)
 
 
 @pytest.mark.parametrize(
@@ -110,7 +166,7 @@ def held_out(probability, predicted=0.1):
             evaluated(held_out=held_out(0.5, 0.19)),
             0,
             "neutral",
-            "and length errors are 0.7 times as large as predicted. No limit",
+            "and length errors are 0.7 times as large as predicted. No largest",
         ),
         (evaluated(held_out=held_out(0.5, None)), 0, "neutral", "Measured on held-out data"),
     ],

@@ -92,7 +92,7 @@ def test_where_another_level_is_stated_numbers_and_words_follow(tmp_path, cache)
     printed, page = done.stdout, (tmp_path / "report.html").read_text()
     for text in (
         "U (99 %) of a measured length",
-        "Expanded uncertainty U over the working volume (99 %, coverage factor 2.58)",
+        "Expanded uncertainty U over all joint limits (99 %, coverage factor 2.58)",
         "Reference lengths [mm]; U: 99 %",
         "changed by more than their expanded uncertainty (99 %; ",
         "[default: 0.99]",

@@ -215,6 +215,21 @@ def test_over_the_volume(result):
             aj.volumetric_uncertainty(uncertainty, **wrong)
 
 
+def test_near_poses_lengths_begin_and_end_near_to_them(result, capture):
+    """A and B are 200 mm apart: lengths of 210 mm between them end 10 mm from a pose."""
+    uncertainty, q = aj.uncertainty_of(result), np.asarray(capture.q)
+    volume = aj.volumetric_uncertainty(uncertainty, points=80, length=210.0, near=q)
+    assert len(volume.u_length) == 80
+    np.testing.assert_allclose(np.linalg.norm(volume.end - volume.start, axis=1), 210, atol=0.5)
+    positions = np.array(list(SOCKETS.values()))
+    for tips, most in ((volume.start, 2), (volume.end, 12)):
+        assert np.linalg.norm(tips[:, None] - positions, axis=2).min(axis=1).max() < most
+    everywhere = aj.volumetric_uncertainty(uncertainty, points=80, length=210.0)
+    assert np.median(volume.u_length) < np.median(everywhere.u_length)
+    with pytest.raises(aj.InputError, match="hardly any two of these poses"):
+        aj.volumetric_uncertainty(uncertainty, length=210.0, near=capture.sockets["A"])
+
+
 def test_what_is_open_has_no_uncertainty(paper_arm, capture):
     """With alpha_6 and d_6 both free neither is determined; the tip is, and so are lengths. Without a length the scale
     is open."""

@@ -4,6 +4,7 @@ In NumPy and in JAX, so that studies start in a compiled program. The starts are
 which has none.
 """
 
+import itertools
 import math
 from typing import Any, NamedTuple
 
@@ -19,6 +20,19 @@ _DIRECTIONS = 300  # of axes that are tried: a hemisphere in steps of about 8 de
 _LARGEST_RADIUS = 30.0  # root mean square distances from the middle
 _TRIED = 16  # directions that are refined
 _FEW_STEPS, _STEPS = 5, 8  # of their refinement, and of the best one's
+_NEAR = 0.01  # of the size of the points: distances from the tips that a nominal arm may leave
+_SEEN = 1e-6  # singular value, of the largest, of what poses show of a target's place
+_ROUNDS = 25  # of the search for a rotation
+# Rotation vectors: none, quarter and half turns about the axes, thirds about the diagonals of a cube.
+_TURNS = np.array(
+    [
+        *(np.pi / 2 * k * axis for axis in np.eye(3) for k in (-1, 1, 2)),
+        *(2 * np.pi / 3 * np.array(signs) / math.sqrt(3) for signs in itertools.product((-1, 1), repeat=3)),
+        *(np.pi * np.array(axis) / math.sqrt(2) for axis in ((1, 1, 0), (1, -1, 0), (1, 0, 1), (1, 0, -1), (0, 1, 1))),
+        np.pi * np.array((0, 1, -1)) / math.sqrt(2),
+        np.zeros(3),
+    ]
+)
 
 # Distances of tips from a geometry, mm, and their derivatives by the tips, unit vectors, and by the geometry's numbers.
 Distances = tuple[Float[AnyArray, " m"], Float[AnyArray, "3 m"], Float[AnyArray, "k m"]]
@@ -269,22 +283,75 @@ def _refined(
     return solution, xp.sum(last[5] ** 2)
 
 
-def frame_and_offset(coordinates: Float[AnyArray, "3 m"], tips: Tips, offset: AnyArray) -> tuple[AnyArray, AnyArray]:
+def frame_and_offset(
+    coordinates: Float[AnyArray, "3 m"],
+    tips: Tips,
+    offset: AnyArray,
+    rotations: Float[AnyArray, "m 3 3"] | None = None,
+) -> tuple[AnyArray, AnyArray]:
     """A station's frame and the place of its target in the last frame, from points that the station measured.
 
     The tips are o + A p, with A the axes of the last frame; in the station's frame, whose rotation in the base frame is
     R, the points y are R y + c = o + A p. In R, c and p this is linear, so R is found as a matrix first, which then
-    becomes the nearest rotation.
+    becomes the nearest rotation. Where that leaves the points far from the tips, as of few poses or of a wrist that
+    turns about one point, rotations are searched, outside of compiled programs; with the orientations of the target
+    that the station saw (``rotations``), where there are some.
     """
     xp, m = namespace(coordinates, tips, offset), coordinates.shape[1]
     axes = xp.stack(tips.axes, axis=1)  # (3, 3, m): columns are axes
     origin = tips.position - xp.einsum("cpm,p->cm", axes, offset)
-    _, _, centred = _about_middle(coordinates)
+    _, size, centred = _about_middle(coordinates)
     identity = xp.asarray(np.eye(3))
-    # Unknowns: R by rows (9, times the size), the station's centre (3), minus p (3).
+    # Unknowns: R by rows (9, times the size), the station's centre (3), p (3).
     by_matrix = (identity[:, :, None, None] * centred[None, None]).reshape(3, 9, m)
     design = xp.concatenate([by_matrix, each_pose(identity, m), -axes], axis=1)
     normal = xp.einsum("cum,cvm->uv", design, design)
     right = xp.einsum("cum,cm->u", design, origin)
     place = solve_positive_definite(normal + 1e-9 * m * xp.asarray(np.eye(15)), right)[12:]
-    return fitted_frame(coordinates, origin + xp.einsum("cpm,p->cm", axes, place)), place
+    frame = fitted_frame(coordinates, origin + xp.einsum("cpm,p->cm", axes, place))
+    if xp is not np:
+        return frame, place
+    rows = np.moveaxis(design, 1, 2).reshape(3 * m, 15) * np.array([float(size)] * 9 + [1.0] * 6)
+    basis, singular, vectors = np.linalg.svd(rows[:, 9:], full_matrices=False)
+    whole = singular > _SEEN * singular[0]
+    basis, inverse = basis[:, whole], vectors[whole].T / singular[whole]
+    left = np.concatenate([rows[:, :9], origin.reshape(-1, 1)], axis=1)
+    left = left - basis @ (basis.T @ left)  # what no centre and no place of the target explains
+    if rotations is not None:
+        # The target's orientation in the last frame, A^T R S with S as the station saw it, is one for all poses.
+        turned = np.einsum("iam,mjb->mabij", axes, np.asarray(rotations)).reshape(m, 9, 9)
+        turned = float(size) * (turned - turned.mean(axis=0)).reshape(9 * m, 9)
+        left = np.concatenate([left, np.concatenate([turned, np.zeros((9 * m, 1))], axis=1)])
+    gram = left.T @ left
+    first = np.asarray(rotation_matrix(frame[:3]))
+    if _costs(gram, first[None])[0] <= (_NEAR * float(size)) ** 2 * m:
+        return frame, place
+    turn = _searched(gram, first)
+    solved = inverse @ (basis.T @ (origin.reshape(-1) - rows[:, :9] @ turn.reshape(9)))
+    place = solved[3:]
+    return fitted_frame(coordinates, origin + np.einsum("cpm,p->cm", axes, place)), place
+
+
+def _costs(gram: Float[np.ndarray, "10 10"], turns: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, " k"]:
+    """Sums of squares of rows (L, b), whose products these are: |L r - b|^2 of rotations r by their rows."""
+    whole = np.concatenate([turns.reshape(-1, 9), -np.ones((len(turns), 1))], axis=1)
+    return np.einsum("ki,ij,kj->k", whole, gram, whole)
+
+
+def _searched(gram: Float[np.ndarray, "10 10"], first: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation with the smallest sum of squares, by Levenberg and Marquardt from rotations all over."""
+    turns = np.concatenate([first[None], np.moveaxis(np.asarray(rotation_matrix(_TURNS.T)), -1, 0)])
+    costs, damping = _costs(gram, turns), np.full(len(turns), 1e-3)
+    crosses = np.asarray(cross_matrix(np.eye(3)))  # of the axes, one each
+    for _ in range(_ROUNDS):
+        by_turn = np.einsum("abe,kbc->keac", crosses, turns).reshape(-1, 3, 9)
+        slope = np.einsum("kei,ki->ke", by_turn, turns.reshape(-1, 9) @ gram[:9, :9] - gram[:9, 9])
+        curvature = np.einsum("kei,ij,kfj->kef", by_turn, gram[:9, :9], by_turn)
+        scale = np.trace(curvature, axis1=1, axis2=2)[:, None, None] * np.eye(3) / 3 + 1e-300 * np.eye(3)
+        step = -np.linalg.solve(curvature + (damping[:, None, None] + 1e-12) * scale, slope[..., None])[..., 0]
+        new = np.moveaxis(np.asarray(rotation_matrix(step.T)), -1, 0) @ turns
+        there = _costs(gram, new)
+        better = there < costs
+        turns, costs = np.where(better[:, None, None], new, turns), np.where(better, there, costs)
+        damping = damping * np.where(better, 0.2, 5.0)
+    return turns[np.argmin(costs)]

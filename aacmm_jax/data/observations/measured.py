@@ -112,7 +112,7 @@ class MeasuredPoints(AbstractObservation):
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
         if not self.target:
             return {self.frame: fitted_frame(self.points.T, tips.position)}
-        frame, place = frame_and_offset(self.points.T, tips, offset)
+        frame, place = frame_and_offset(self.points.T, tips, offset, getattr(self, "rotations", None))
         return {self.frame: frame, offset_of(self.target): place}
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:

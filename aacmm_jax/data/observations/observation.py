@@ -318,6 +318,15 @@ def stated_quantities(observation: AbstractObservation) -> tuple[Quantity, ...]:
     return tuple(Quantity(e.says, stated[e.name], e.unit) for e in others if float(stated[e.name][0]) != 0)
 
 
+def stated_u(observation: AbstractObservation) -> Float[np.ndarray, " k"]:
+    """The standard uncertainties that were stated of what an observation measured, mm; none where none was stated."""
+    stored = observation.stored()
+    if stored.get("covariance") is not None:
+        return np.sqrt(np.diagonal(np.asarray(stored["covariance"]), axis1=-2, axis2=-1)).ravel()
+    in_mm = any(entry.name == "u" and entry.unit == "mm" for entry in observation.entries)
+    return np.asarray(stored["u"], dtype=float).ravel() if in_mm and stored.get("u") is not None else np.zeros(0)
+
+
 def offset_of(target: str) -> str:
     """Name of the unknown place of a target in the last frame."""
     return f"offset of {target}"
