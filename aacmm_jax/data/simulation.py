@@ -137,7 +137,7 @@ class _Recorder(NamedTuple):
         at_zero = np.concatenate([np.zeros((len(labels), holding.joints)), temperature], axis=1)
         targets = targets / length_scale(holding.geometry, at_zero)[:, None]
         angles = random_configurations(holding, targets, reach_key, self.limits, labels=labels)
-        torques = [holding_torques(holding, angles)] if holding.torques else []
+        torques = [holding_torques(holding, np.asarray(angles))] if holding.torques else []
         return np.concatenate([angles, *torques, temperature], axis=1)
 
     def read(self, q: Float[np.ndarray, "m columns"], key: Array) -> Float[np.ndarray, "m columns"]:

@@ -113,7 +113,7 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
 def masses_sentence(arm: Arm) -> str | None:
     """Which masses the bending of an arm's joints was computed with; None where masses are not taken as known."""
     loads = None if arm.corrections is None else loads_of(arm)
-    if loads is None or not np.any(arm.corrections.functions.by_gravity):
+    if arm.corrections is None or loads is None or not np.any(arm.corrections.functions.by_gravity):
         return None
     links = ", ".join(f"{mass:.3g}" for mass in loads.mass)
     return (
