@@ -190,12 +190,16 @@ class CalibrationRecord(NamedTuple):
         return vectors
 
     def evaluations(self) -> dict[str, Evaluation]:
-        """The three arms on the capture that was identified from."""
+        """The nominal arm, the arm as found (where that is known), that after stage 1 and the calibrated one on the
+        capture that was identified from."""
         capture, calibrated = self.recording.capture, evaluate(self.calibrated.arm, self.recording.capture)
         leaves = [jax.tree.leaves(specification.arm) for specification in (self.stage1, self.calibrated)]
         alike = len(leaves[0]) == len(leaves[1]) and all(map(np.array_equal, *leaves))
         stage1 = calibrated if alike else evaluate(self.stage1.arm, capture)
-        return {"nominal": evaluate(self.recording.nominal.arm, capture), "stage1": stage1, "calibrated": calibrated}
+        as_found = self.recording.as_found
+        before = {} if as_found is None else {"as_found": evaluate(as_found.arm, capture)}
+        nominal = evaluate(self.recording.nominal.arm, capture)
+        return {"nominal": nominal, **before, "stage1": stage1, "calibrated": calibrated}
 
 
 @checked_arguments

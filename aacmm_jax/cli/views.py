@@ -13,7 +13,7 @@ from ..summaries.tables import Line, Styled, Table, View, decimals_for, formatte
 from ..uncertainty.coverage import LEVEL_IN_PERCENT, U_AT_LEVEL
 
 _MOST_PARTS = 12  # rows of a table
-_ARMS = {"nominal": "nominal", "calibrated": "calibrated"}
+_ARMS = {stage: words for stage, words in STAGES.items() if stage != "stage1"}
 _GROUPS = {
     "held_out": "Held-out data, which were not used for the calibration",
     "identified_from": "Data used for identification",
@@ -263,8 +263,9 @@ def demo(summary: dict[str, Any]) -> View:
         "Deltam, largest half range [mm]": "deltam_mm",
         f"RMS error of {summary['checks']} lengths of {summary['check_length_mm']:g} mm [mm]": "check_rms_mm",
     }
-    cells = [(text, *(summary[stage][key] for stage in STAGES)) for text, key in rows.items()]
-    yield listed("Lengths and repeatability", cells, ("", *STAGES.values()))
+    stages = {stage: words for stage, words in STAGES.items() if stage in summary}
+    cells = [(text, *(summary[stage][key] for stage in stages)) for text, key in rows.items()]
+    yield listed("Lengths and repeatability", cells, ("", *stages.values()))
     yield tables.truth_table(summary)
     yield (
         f"k = {summary['scale_k']:.7f}, u(k) = {summary['scale_u']:.1e}: stage 1 uses repeatability only, so all "

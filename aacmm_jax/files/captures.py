@@ -97,6 +97,8 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
         tables["urdf"] = Table(variables, {"base": urdf.base, "tip": urdf.tip})
     if recording.true is not None:
         tables["true_arm"] = arm_table(recording.true)
+    if recording.as_found is not None:
+        tables["as_found_arm"] = arm_table(recording.as_found)
     if recording.spheres:
         tables["sphere"] = sphere_table(recording.spheres, arm)
     if recording.usual is not None:
@@ -126,7 +128,9 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
         tuple(zip(given.get("repeated_starts", ()), given.get("repeated_ends", ()), strict=True)),
     )
     numbers = sorted(int(name.removeprefix(_OBSERVATION)) for name in stored.tables if name.startswith(_OBSERVATION))
-    true = specification_of(path, stored, "true_arm") if "true_arm" in stored.tables else None
+    true, as_found = (
+        specification_of(path, stored, name) if name in stored.tables else None for name in ("true_arm", "as_found_arm")
+    )
     with naming(path):
         capture = Capture(
             {name: q[owner == name] for name in names},
@@ -148,6 +152,7 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
         true,
         spheres=spheres,
         usual=record_in(ArmNoise, USUAL_NOISE, stored.tables.get("usual_noise")),
+        as_found=as_found,
         **values_in(Recording, RECORDING, stored.tables, stored.attributes),
     )
 

@@ -301,6 +301,7 @@ class Sessions(Strict):
 
 class _Poses(Recorded):
     arm: str
+    as_found: str | None = None  # the arm with the parameters that its controller had on arrival
     base: str | None = None  # links of a URDF
     tip: str | None = None
     probe: Point | None = None  # mm, from the tip link

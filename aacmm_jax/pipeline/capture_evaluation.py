@@ -107,6 +107,7 @@ def evaluate_capture(record: CalibrationRecord, recording: Recording, **options:
         recording._replace(
             capture=capture,
             nominal=record.recording.nominal,
+            as_found=recording.as_found or record.recording.as_found,
             measuring_range=chosen.measuring_range or recording.measuring_range,
         ),
         record.calibrated,

@@ -1,5 +1,6 @@
 """Evaluations and acceptance tests as plain dictionaries with the unit in every key; ``--json`` prints them."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from ..diagnostics.pose_residuals import rms
 from ..pipeline.cross_validation import groups_of
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .calibration import agreement_row, length_metrics, metrics, metrics_by_socket_and_length
+from .result_tables import BEFORE
 from .tables import attributes, plain, rows_of
 from .verdicts import evaluation_verdict
 
@@ -36,7 +38,8 @@ _GROUPS = {"held_out": "held-out data", "identified_from": "the data used for id
 def evaluation_summary(
     record: EvaluationRecord, tests: dict[str, list[AcceptanceTest]] | None = None
 ) -> dict[str, Any]:
-    """The nominal and the calibrated arm on a capture, on held-out data and on those identified from; acceptance tests.
+    """The nominal and the calibrated arm, and the arm as found where that is known, on a capture, on held-out data and
+    on those identified from; acceptance tests.
 
     A length counts as held out if at least one of its ends was not identified from. Errors on held-out data stand
     beside those that the uncertainty of the calibration predicts. ``tests`` (`EvaluationRecord.acceptance`) are run if
@@ -70,7 +73,7 @@ def evaluation_summary(
             summary["warnings"] += _add_prediction(summary[group], record, part, lengths)
     summary["kept"], summary["failed"] = _exceeded(summary, record)
     tests = record.acceptance() if tests is None else tests
-    summary |= _judged(record, tests["calibrated"], tests["nominal"])
+    summary |= _judged(record, tests)
     summary["verdict"] = evaluation_verdict(summary, len(summary["warnings"]))._asdict()
     return summary | {"calibration_warnings": list(record.calibration_warnings)}
 
@@ -166,7 +169,9 @@ def _add_prediction(
             "probability": plain(of_lengths.probability),
         },
     }
-    before, after = (group[stage].get("observed_rms_mm", group[stage].get("rms_mm")) for stage in record.arms())
+    before, after = (
+        group[stage].get("observed_rms_mm", group[stage].get("rms_mm")) for stage in ("nominal", "calibrated")
+    )
     unseen = surprise(poses, unexpected, by_name, lambda: _with_probe_fitted(record.uncertainty, part))
     return sentences(unseen + no_better(before, after))
 
@@ -218,17 +223,21 @@ def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = No
         "warnings": unstated_uncertainty_warning(tests),
         "kept": [],
         "failed": [],
-        **_judged(record, tests),
+        **_judged(record, {"calibrated": tests}),
     }
     return summary | {"verdict": evaluation_verdict(summary, len(summary["warnings"]))._asdict()}
 
 
 def _judged(
-    record: EvaluationRecord | PointsRecord, tests: list[AcceptanceTest], before: list[AcceptanceTest] | None = None
+    record: EvaluationRecord | PointsRecord, by_stage: Mapping[str, Sequence[AcceptanceTest]]
 ) -> dict[str, Any]:
-    """Acceptance tests, and what adds uncertainty to their values; ``before``: those of the nominal arm, whose metrics
-    are added."""
-    earlier = {(test.title, metric.name): metric for test in before or () for metric in test.metrics}
+    """Acceptance tests, and what adds uncertainty to their values: those of the calibrated arm, to whose metrics those
+    of the nominal arm and of the arm as found are added."""
+    tests = by_stage["calibrated"]
+    earlier = {
+        stage: {(test.title, metric.name): metric for test in by_stage.get(stage, ()) for metric in test.metrics}
+        for stage in BEFORE
+    }
     influences = record.influences
     bodies = {"artefact": influences.artefact, "arm": influences.arm}
     expansions = {
@@ -240,7 +249,8 @@ def _judged(
             | {
                 "rule": RULES[test.rule],
                 "figures": [
-                    _metric(metric, earlier.get((test.title, metric.name))) | {"symbol": test.symbol(metric)}
+                    _metric(metric, {stage: of.get((test.title, metric.name)) for stage, of in earlier.items()})
+                    | {"symbol": test.symbol(metric)}
                     for metric in test.metrics
                 ],
             }
@@ -251,7 +261,7 @@ def _judged(
     }
 
 
-def _metric(metric: Metric, earlier: Metric | None) -> dict[str, Any]:
+def _metric(metric: Metric, earlier: Mapping[str, Metric | None]) -> dict[str, Any]:
     def part(value: MetricValue) -> dict[str, Any]:
         return attributes(value, "where", value_mm="value", expanded_mm="expanded", limit_mm="limit")
 
@@ -259,8 +269,8 @@ def _metric(metric: Metric, earlier: Metric | None) -> dict[str, Any]:
         **attributes(metric, "name", "decision"),
         "what": METRICS[metric.name],
         **part(metric.worst),
-        "as_found_mm": None if earlier is None else earlier.value,
-        "as_found_decision": None if earlier is None else earlier.decision,
+        **{f"{stage}_mm": None if before is None else before.value for stage, before in earlier.items()},
+        **{f"{stage}_decision": None if before is None else before.decision for stage, before in earlier.items()},
         "failing": sum(value.decision == "fails" for value in metric.values),
         "parts": [part(value) | {"decision": value.decision} for value in metric.values],
     }

@@ -11,6 +11,7 @@ from ..calibration.agreement import SIGNIFICANCE
 from ..core.text import shorten
 from ..diagnostics.findings import Finding
 from ..uncertainty.coverage import U_AT_LEVEL
+from .result_tables import BEFORE
 from .tables import two_digits
 
 _LACKING = "the residuals show errors that the model does not describe"  # what tests of residuals doubt
@@ -122,11 +123,12 @@ def evaluation_verdict(summary: Mapping[str, Any], own_warnings: int = 0) -> Ver
     if decision == "conforms":
         incomplete = any(test["missing"] for test in summary["acceptance"] if test["decision"])
         without = dict.fromkeys(metric["name"] for metric in metrics if metric["decision"] is None)
-        before = {metric["name"]: metric["as_found_decision"] for metric in metrics}
-        says = f"Conforms{' (calibrated arm)' if any(before.values()) else ''}: all limits given are met"
+        before = {stage: {row["name"]: row.get(f"{stage}_decision") for row in metrics} for stage in BEFORE}
+        says = f"Conforms{' (calibrated arm)' if any(before['nominal'].values()) else ''}: all limits given are met"
         says += f" ({shorten(list(dict.fromkeys(names)))})" if names else ""
-        failed = [name for name, decision in before.items() if decision == "fails"]
-        says += f"; the nominal arm fails ({shorten(failed)})" if failed else ""
+        for stage, words in (("nominal", "the nominal arm"), ("as_found", "the arm as found")):
+            failed = [name for name, decision in before[stage].items() if decision == "fails"]
+            says += f"; {words} fails ({shorten(failed)})" if failed else ""
         says += f"; no limit was given for {shorten(list(without))}" if without else ""
         says += "; the procedure of a test was not complete." if incomplete else "."
         return Verdict("unsure" if incomplete or own_warnings else "good", says)

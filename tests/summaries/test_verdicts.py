@@ -75,7 +75,7 @@ def test_of_a_simulation_and_of_what_is_not_determined():
 
 def evaluated(*decisions, missing=(), found=None, **more):
     figures = [
-        {"name": f"E_{i}", "decision": decision, "as_found_decision": found} for i, decision in enumerate(decisions)
+        {"name": f"E_{i}", "decision": decision, "nominal_decision": found} for i, decision in enumerate(decisions)
     ]
     test = {"decision": decisions[0] if decisions else None, "missing": list(missing), "figures": figures}
     return {"acceptance": [test], "failed": [], "kept": [], "held_out": None} | more
