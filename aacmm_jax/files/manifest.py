@@ -115,7 +115,7 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
 def _as_found(file: str | Path, nominal: Arm) -> ArmSpecification:
     """The arm as it arrived, which reads as the nominal one does."""
     specification = read_arm(file)[0]
-    arm = specification.arm.replace(thermometer=nominal.thermometer)
+    arm = specification.arm.replace(torques=nominal.torques, thermometer=nominal.thermometer)
     if (arm.joints, arm.prismatic) != (nominal.joints, nominal.prismatic):
         raise InputError(
             f"as_found = '{Path(file).name}' has {arm.joints} joints or other prismatic joints than arm, which has "
