@@ -13,9 +13,8 @@ from ..drift.results import Drift, Trend
 from ..plot.charts import Chart
 from ..plot.drift import trend_plots
 from ..summaries.drift import comparison_tables
-from .elements import Report, Section
+from .elements import Block, Report, Section
 
-_TOGETHER = "What was found"
 _CHANGED = (
     "Changes of the parameters from the first calibration, divided by their expanded uncertainty; below, for three "
     "calibrations or more, the changes of lengths over the working volume."
@@ -27,7 +26,8 @@ def comparison_report(summary: dict[str, Any]) -> Report:
     p, lengths = summary["joint"]["p"], summary["lengths"]
     changed = p is not None and p < 1 - summary["level"]
     doubtful = p is None or changed or bool(summary["warnings"] or summary.get("failed"))
-    chart = Chart("changes", "Changes", _CHANGED, trend_plots(_trend_of(summary)))
+    tables: Any = comparison_tables(summary)  # and sentences
+    blocks: list[Block] = [Chart("changes", "Changes", _CHANGED, trend_plots(_trend_of(summary))), *tables]
     return Report(
         title=f"Comparison of calibrations, {summary['arm'] or 'an arm'}",
         subtitle=f"{pluralise(len(summary['trend']), 'calibration')}: {summary['new']} compared with {summary['old']}",
@@ -40,8 +40,8 @@ def comparison_report(summary: dict[str, Any]) -> Report:
             ("Largest change of a length", f"{lengths['largest_mm']:.4f}\u00a0mm"),
         ],
         sections=[
-            Section("found", _TOGETHER, [*summary["findings"]]),
-            Section("changes", "Parameters and lengths", [chart, *comparison_tables(summary)]),
+            Section("found", "What was found", list(summary["findings"])),
+            Section("changes", "Parameters and lengths", blocks),
         ],
     )
 

@@ -287,7 +287,7 @@ def shared_rows(shared: SharedErrors) -> list[dict[str, Any]]:
 
 def cross_validation_summary(validation: CrossValidation) -> dict[str, Any]:
     """All groups together, and every group, the most improbable first; mm."""
-    chances = [min(filter(math.isfinite, group.probabilities), default=math.nan) for group in validation.groups]
+    chances = [min(filter(math.isfinite, chances), default=math.nan) for chances in validation.probabilities]
     rows = []
     for i, (label, group, chance) in enumerate(zip(validation.labels, validation.groups, chances, strict=True)):
         error, u = (rms(values) for values in (group.length_error, group.length_u))
