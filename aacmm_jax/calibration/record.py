@@ -16,7 +16,7 @@ from ..data.observations.observation import stated_u
 from ..data.recording import Recording
 from ..kinematics.arm import Arm, joint_limits, parameter_names, value_of
 from ..kinematics.corrected_arm import function_values
-from ..kinematics.corrections import Term
+from ..kinematics.correction_kinds import Term
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..solver.reason import MAX_STEPS, STALLED, Reason
 from ..uncertainty.arm_uncertainty import Uncertainty
@@ -315,10 +315,12 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
         covariance, is_open, names = np.asarray(result.covariance), np.asarray(result.open), result.names
         u_k, surplus_k = None if np.isnan(result.u_k) else np.asarray(result.u_k), np.asarray(result.surplus_k)
         lengths = len(result.recording.capture.lengths)
+        between = None if result.validation is None else result.validation.between()
     else:
         arm, scale, names = result.arm, result.scale, result.space.names
         covariance, _, is_open, noise, components = result.parameter_covariance
         shared = None if isinstance(result, Identification) else result.shared
+        between = None
         u_k, surplus_k, lengths = (None, None, 0) if scale is None else (scale.u, scale.surplus, len(scale.nominal))
     # Parts of the covariance of the parameters, with errors of the tip that poses share.
     of_tips = None if shared is None else shared.of_tips
@@ -334,6 +336,7 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
         names=names,
         scatter_degrees_of_freedom=float(result.degrees_of_freedom),
         lengths=lengths,
+        between=between,
     )
 
 

@@ -101,6 +101,9 @@ def capture(summary: dict[str, Any]) -> View:
     ends = {end: end if slides else f"{end} [deg]" for end in ("lowest", "highest")}
     columns = {heading: lambda row, end=end: reading(row, end) for end, heading in ends.items()}
     yield listed("Readings", summary["ranges"], {"joint": "joint"} | columns)
+    if summary["largest_torques_Nm"] is not None:
+        torques = ", ".join(f"{torque:.3g}" for torque in summary["largest_torques_Nm"])
+        yield f"Largest torques of the joints: {torques} N m."
     if summary["temperature_C"] is not None:
         low, high = summary["temperature_C"]
         yield f"Temperature: {low:.2f} to {high:.2f} C."
