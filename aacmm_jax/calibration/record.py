@@ -16,7 +16,7 @@ from ..data.observations.observation import stated_u
 from ..data.recording import Recording
 from ..kinematics.arm import Arm, joint_limits, parameter_names, value_of
 from ..kinematics.corrected_arm import function_values
-from ..kinematics.corrections import Term
+from ..kinematics.correction_kinds import Term
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..solver.reason import MAX_STEPS, STALLED, Reason
 from ..uncertainty.arm_uncertainty import Uncertainty

@@ -19,7 +19,8 @@ from ..core.units import ARCSEC
 from ..kinematics.arm import DOWN, Arm
 from ..kinematics.chain import forward_pass, joint_motion
 from ..kinematics.corrected_arm import function_values
-from ..kinematics.corrections import Term, all_sought, model_of, model_with, terms_of
+from ..kinematics.correction_kinds import Term
+from ..kinematics.corrections import all_sought, model_of, model_with, terms_of
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .equations import Block, Rows, wider
 from .findings import Case, Finding, by_equations, chance_text, rounded

@@ -16,6 +16,7 @@ from ..data.observations.declared import Entry
 from ..data.observations.observation import AbstractObservation, kinds
 from ..data.recording import ProbedSphere, Recording, checked_sphere
 from ..kinematics.arm import Arm, correction_names, readings_unit
+from ..kinematics.chain import beside_joints
 from ..kinematics.corrected_arm import loads_of
 from ..kinematics.parameters import ArmSpecification, UrdfSource, single
 from ..kinematics.priors import Prior
@@ -183,17 +184,20 @@ def _observation(path: str | os.PathLike, table: StoredTable) -> AbstractObserva
 
 
 def _reading_variables(name: str, readings: Float[np.ndarray, "N n"], arm: Arm, rows: str = "pose") -> dict:
-    """Readings as variables: those of the joints, and the temperature that may follow them."""
+    """Readings as variables: those of the joints, and the torques and the temperature that may follow them."""
     variables = {name: Variable((rows, "joint"), readings[:, : arm.joints], readings_unit(arm), "joint reading")}
-    if readings.shape[1] > arm.joints:
-        variables["temperature"] = Variable((rows,), readings[:, arm.joints], "degC", "temperature of the arm")
+    torques, temperature = (readings[:, columns] for columns in beside_joints(arm.joints, readings.shape[1]))
+    if torques.size:
+        variables["torque"] = Variable((rows, "joint"), torques, "N m", "torque of the joint's drive")
+    if temperature.size:
+        variables["temperature"] = Variable((rows,), temperature[:, 0], "degC", "temperature of the arm")
     return variables
 
 
 def _readings_of(table: Mapping[str, np.ndarray], name: str) -> Float[np.ndarray, "N n"]:
-    """The readings that `_reading_variables` wrote, with the temperature last where there is one."""
-    temperature = table.get("temperature")
-    return table[name] if temperature is None else np.concatenate([table[name], temperature[:, None]], axis=1)
+    """The readings that `_reading_variables` wrote, with torques and the temperature last where there are such."""
+    beside = [table[column] for column in ("torque", "temperature") if column in table]
+    return np.column_stack([table[name], *beside]) if beside else table[name]
 
 
 def lengths_of(stored: Stored) -> tuple[ReferenceLength, ...]:
@@ -238,6 +242,7 @@ def arm_table(specification: ArmSpecification) -> Table:
     arm, prior = single(specification.arm), specification.prior
     values = dict.fromkeys(ARM) | specification._asdict() | {kind: getattr(arm, kind) for kind in GEOMETRY}
     values |= {"prismatic": arm.prismatic or None, "thermometer": arm.thermometer or None}
+    values["torques"] = arm.torques or None
     if arm.limits is not None:
         values["lowest"], values["highest"] = np.transpose(arm.limits)
     if arm.corrections is not None:
@@ -273,6 +278,7 @@ def specification_of(path: str | os.PathLike, stored: Stored, name: str) -> ArmS
             **{kind: table.get(kind) if kind == "beta" else table[kind] for kind in GEOMETRY},
             limits=limits,
             prismatic=list(attributes.get("prismatic", ())),
+            torques=bool(attributes.get("torques", False)),
             thermometer=bool(attributes.get("thermometer", False)),
         )
         if "coefficients" in table:

@@ -17,6 +17,7 @@ from ..data.capture import Capture, ReferenceLength, check_readings, join_sessio
 from ..data.observations.held import Socket
 from ..data.recording import ProbedSphere, Recording, checked_sphere
 from ..kinematics.arm import Arm
+from ..kinematics.chain import beside_joints
 from ..kinematics.parameters import ArmSpecification
 from ..kinematics.workspace import Reach
 from .arms import arm_beside, for_capture, read_arm, usual_noise
@@ -92,8 +93,9 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
                 "[sessions] applies only to tables with a session, but no table has a session; remove [sessions]."
             )
         capture = _capture(lengths, observed, probe == "remounted")
-        if capture.columns == nominal.arm.joints + 1:
-            nominal = nominal._replace(arm=nominal.arm.replace(thermometer=True))
+        torques, temperature = beside_joints(nominal.arm.joints, capture.columns)
+        beside = {"torques": torques.stop > torques.start, "thermometer": temperature.start < capture.columns}
+        nominal = nominal._replace(arm=nominal.arm.replace(**{key: True for key, given in beside.items() if given}))
         check_readings(capture, nominal.arm)
         as_found = None if model.as_found is None else _as_found(arm_beside(path.parent, model.as_found), nominal.arm)
         recording = Recording(
@@ -113,7 +115,7 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
 def _as_found(file: str | Path, nominal: Arm) -> ArmSpecification:
     """The arm as it arrived, which reads as the nominal one does."""
     specification = read_arm(file)[0]
-    arm = specification.arm.replace(thermometer=nominal.thermometer)
+    arm = specification.arm.replace(torques=nominal.torques, thermometer=nominal.thermometer)
     if (arm.joints, arm.prismatic) != (nominal.joints, nominal.prismatic):
         raise InputError(
             f"as_found = '{Path(file).name}' has {arm.joints} joints or other prismatic joints than arm, which has "

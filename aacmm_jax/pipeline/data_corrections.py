@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from ..calibration.evaluation import evaluate
 from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
@@ -101,6 +102,32 @@ def with_corrected_readings(
         f"{again.observed.rms:.3g} mm RMS. To state this in the manifest: {_line(best)}."
     )
     return again._replace(decisions=(*record.decisions, says)), best
+
+
+def with_readings_of_arm(record: CalibrationRecord, capture: Capture) -> tuple[Capture, tuple[str, ...]]:
+    """A capture to evaluate a calibration on, with the order, signs and units of its readings with which they match the
+    calibrated arm, where they do not as they are and a single explanation makes them match; and what was found.
+
+    Zeros are not corrected: another zero than at the calibration is an error of the arm.
+    """
+    observed = evaluate(record.calibrated.arm, capture, noise=record.noise).observed
+    assert observed is not None
+    poses = [*capture.sizes, *(observation.q.shape[0] for observation in capture.observations)]
+    rms = float(np.sqrt(np.average(np.asarray(observed.rms) ** 2, weights=poses)))
+    if rms <= record.largest_plausible_residual:
+        return capture, ()
+    try:
+        # By the nominal arm, for which explanations that are the same by its symmetry are one.
+        check = check_capture(record.recording.nominal.arm, capture)
+    except InputError:  # neither sockets nor points, or too few
+        return capture, ()
+    best, corrected = check.best, corrected_capture(capture, check.best)
+    if not check.explained or check.fits or check.others or corrected is None:
+        return capture, ()
+    if any(best.offsets):
+        return capture, (f"The readings do not match the calibrated arm, unless {explanation_words(best)}.",)
+    says = f"The readings were corrected to match the calibrated arm: {explanation_words(best)}."
+    return corrected, (f"{says} To state this in the manifest: {_line(best)}.",)
 
 
 def corrected_capture(capture: Capture, explanation: Explanation) -> Capture | None:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance.judgement import RULES
+from ..acceptance.judgement import RULES, Rule, deciding_uncertainty
 from ..acceptance.record import EvaluationRecord, PointsRecord, check_geometry, unstated_uncertainty_warning
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
 from ..calibration.agreement import NOTHING, Agreement
@@ -21,11 +21,11 @@ from ..diagnostics.pose_residuals import rms
 from ..pipeline.cross_validation import groups_of
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .calibration import agreement_row, length_metrics, metrics, metrics_by_socket_and_length
+from .maxima import judged_maxima
 from .result_tables import BEFORE
 from .tables import attributes, plain, rows_of
 from .verdicts import evaluation_verdict
 
-_LIMITED = {"rms_mm": "RMS distance", "deltam_mm": "Deltam", "length_error_largest_mm": "largest length error"}
 _EXPANSION = {
     "coefficient_per_k": "coefficient",
     "u_coefficient_per_k": "u_coefficient",
@@ -71,7 +71,9 @@ def evaluation_summary(
         }
         if not wanted:
             summary["warnings"] += _add_prediction(summary[group], record, part, lengths)
-    summary["kept"], summary["failed"] = _exceeded(summary, record)
+    decisions = judged_maxima(summary, record)
+    for key, decision in (("kept", "conforms"), ("failed", "fails"), ("undecided", "undecided")):
+        summary[key] = [judged.says for judged in decisions if judged.decision == decision]
     tests = record.acceptance() if tests is None else tests
     summary |= _judged(record, tests)
     summary["verdict"] = evaluation_verdict(summary, len(summary["warnings"]))._asdict()
@@ -162,7 +164,7 @@ def _add_prediction(
         if any(abs(row["error_over_expanded"] or 0.0) > 1 for row in group["lengths"]):
             unexpected = of_lengths
     group["predicted"] = {
-        "poses": agreement_row(poses),
+        "poses": agreement_row(poses) | {"degrees_of_freedom": plain(poses.degrees_of_freedom)},
         "lengths": {
             "lengths": of_lengths.count,
             "normalised_error_rms": plain(of_lengths.rms / of_lengths.predicted),
@@ -190,25 +192,6 @@ def _with_probe_fitted(uncertainty: Uncertainty | None, part: Capture | None) ->
     return errors.of(errors.parts)
 
 
-def _exceeded(summary: dict[str, Any], record: EvaluationRecord) -> tuple[list[str], list[str]]:
-    """Sentences on limits kept and limits exceeded by the calibrated arm, on held-out data if there are any."""
-    kept, failed = [], []
-    for name, limit in record.maxima.items():
-        for group, where in _GROUPS.items():
-            values = (summary[group] or {}).get("calibrated", {})
-            # Of a capture with observations besides sockets, the RMS distance is that of all poses.
-            key = "observed_rms_mm" if name == "rms_mm" and "observed_rms_mm" in values else name
-            if key in values:
-                relation, verdicts = ("within", kept) if values[key] <= limit else ("over", failed)
-                verdicts.append(
-                    f"{_LIMITED[name]} on {where} is {values[key]:.4f} mm, {relation} the limit of {limit:g} mm."
-                )
-                break
-        else:
-            failed.append(f"{_LIMITED[name]} has a limit of {limit:g} mm, but cannot be determined from these data.")
-    return kept, failed
-
-
 def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = None) -> dict[str, Any]:
     """Acceptance tests of points; ``tests`` (`PointsRecord.acceptance`) are run if not given."""
     tests = record.acceptance() if tests is None else tests
@@ -223,6 +206,7 @@ def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = No
         "warnings": unstated_uncertainty_warning(tests),
         "kept": [],
         "failed": [],
+        "undecided": [],
         **_judged(record, {"calibrated": tests}),
     }
     return summary | {"verdict": evaluation_verdict(summary, len(summary["warnings"]))._asdict()}
@@ -250,7 +234,7 @@ def _judged(
                 "rule": RULES[test.rule],
                 "figures": [
                     _metric(metric, {stage: of.get((test.title, metric.name)) for stage, of in earlier.items()})
-                    | {"symbol": test.symbol(metric)}
+                    | {"symbol": test.symbol(metric), "deciding_mm": _deciding(metric, test.rule)}
                     for metric in test.metrics
                 ],
             }
@@ -259,6 +243,14 @@ def _judged(
         **attributes(record, "standards", u_test_mm="u_test"),
         "influences": {"u_relative": influences.u_relative} | expansions,
     }
+
+
+def _deciding(metric: Metric, rule: Rule) -> float | None:
+    """The expanded uncertainty with which an undecided metric would be decided, mm."""
+    worst = metric.worst
+    if worst.decision != "undecided" or worst.limit is None:
+        return None
+    return deciding_uncertainty(worst.value, worst.limit, rule)
 
 
 def _metric(metric: Metric, earlier: Mapping[str, Metric | None]) -> dict[str, Any]:

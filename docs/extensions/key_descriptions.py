@@ -55,6 +55,8 @@ DESCRIPTIONS = {
     "theta": "Zero offset.",
     "beta": "Hayati's angle.",
     "limits": "Lowest and highest reading.",
+    "torques": "In an arm file, whether readings have the torque of each joint beside them; in a manifest, the columns "
+    "of these torques, N m.",
     "thermometer": "Whether readings have the arm's temperature as a last column.",
     "identification": "Free and fixed parameters, and the bounds of the free parameters.",
     "held": "Names of the fixed parameters.",

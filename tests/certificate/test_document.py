@@ -25,7 +25,7 @@ from aacmm_jax.files.administrative_data import (
     read_administrative_data,
 )
 from aacmm_jax.kinematics import corrections as kinds
-from aacmm_jax.kinematics.corrections import Loads
+from aacmm_jax.kinematics.correction_kinds import Loads
 from tests.certificate import dcc_model
 from tests.refusals import assert_refused
 from tests.renamed_sockets import renamed_sockets

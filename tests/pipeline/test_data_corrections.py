@@ -124,3 +124,28 @@ def test_right_readings_stay():
     record = aj.calibrate_capture(recording, model="dh", **OPTIONS)
     assert not record.decisions
     assert np.array_equal(record.recording.capture.observations[0].q, recording.capture.observations[0].q)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("at_calibration", [False, True])
+def test_the_readings_of_an_evaluation_are_those_of_the_calibration(at_calibration):
+    """Wrong signs in the capture of the calibration are in that of the evaluation, too; or in the latter alone."""
+    recording, _ = recorded("ur10e", 40, turned if at_calibration else lambda q, points: (q, points))
+    record = aj.calibrate_capture(recording, model="dh", **OPTIONS)
+    observation = recorded("ur10e", 40, turned)[0].capture.observations[0]
+    wrong = aj.Capture({}, [], [observation.select(np.arange(25))])
+    evaluation = aj.evaluate_capture(record, recording._replace(capture=wrong))
+    assert not evaluation.independent
+    assert "column 3 has the opposite sign" in evaluation.warnings[0]
+    assert aj.evaluate(record.calibrated.arm, evaluation.recording.capture).observed.rms[0] < 0.1
+    assert not any("check that the arm is the same" in warning for warning in evaluation.warnings)
+
+
+@pytest.mark.slow
+def test_zeros_of_an_evaluation_are_not_corrected():
+    recording, _ = recorded("ur10e", 40)
+    record = aj.calibrate_capture(recording, model="dh", **OPTIONS)
+    wrong = recorded("ur10e", 40, shifted)[0]
+    evaluation = aj.evaluate_capture(record, wrong)
+    assert "unless the zero of joint 3 is -28" in evaluation.warnings[0]
+    assert np.array_equal(evaluation.recording.capture.observations[0].q, wrong.capture.observations[0].q)
