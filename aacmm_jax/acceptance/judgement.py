@@ -86,6 +86,13 @@ def decide(error: float, limit: _Millimetres, expanded: _Millimetres = 0.0, rule
     return "conforms" if normal.cdf(limit) - normal.cdf(-limit) >= _PROBABILITY else "undecided"
 
 
+def deciding_uncertainty(error: float, limit: float, rule: Rule) -> float:
+    """The largest expanded uncertainty with which `decide` accepts or rejects an error, mm; 0 at the limit itself."""
+    if rule == "simple":
+        return limit / _RATIO
+    return abs(limit - abs(error)) * (1.0 if rule == "iso-2013" else COVERAGE_FACTOR / GUARD_FACTOR)
+
+
 def worst(decisions: list[Decision]) -> Decision | None:
     """The worst of several decisions; None if there are none."""
     return next((decision for decision in DECISIONS if decision in decisions), None)

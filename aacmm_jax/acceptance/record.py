@@ -198,8 +198,10 @@ class EvaluationRecord(NamedTuple):
     rule: Rule | None = None  # None: that of each standard
 
     def arms(self) -> dict[str, ArmSpecification]:
-        """The nominal and the calibrated arm."""
-        return {"nominal": self.recording.nominal, "calibrated": self.calibrated}
+        """The nominal arm, the arm as found, where that is known, and the calibrated arm."""
+        as_found = self.recording.as_found
+        before = {} if as_found is None else {"as_found": as_found}
+        return {"nominal": self.recording.nominal, **before, "calibrated": self.calibrated}
 
     def held_out_lengths(self) -> list[int]:
         """Indices of the lengths with an end that the calibration was not identified from."""

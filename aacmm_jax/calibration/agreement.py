@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from ..core.distributions import chance
 from ..core.text import common_labels
+from ..uncertainty.between_groups import BetweenGroups
 
 SIGNIFICANCE = 0.01  # probability below which errors beyond their prediction are not put down to chance
 _HALF = SIGNIFICANCE / 2  # for single groups of a cross-validation; the other half is for all of them together
@@ -30,6 +31,16 @@ class Agreement(NamedTuple):
     def probability(self) -> float:
         """Of at least such a sum of squares by chance where the prediction is right; NaN where nothing is predicted."""
         return chance(self.rms, self.predicted, self.degrees_of_freedom, self.noise_degrees_of_freedom)
+
+    def by_groups(self, between: BetweenGroups | None) -> "Agreement":
+        """The same, predicted as groups that were held out have shown; as it is where there were none."""
+        if between is None or not self.degrees_of_freedom > 0:
+            return self
+        return self._replace(
+            predicted=self.predicted * math.sqrt(between.ratio),
+            degrees_of_freedom=between.scatter(self.degrees_of_freedom),
+            noise_degrees_of_freedom=between.certainty(self.noise_degrees_of_freedom),
+        )
 
 
 NOTHING = Agreement(0, math.nan, math.nan, math.nan, math.inf)  # where there is nothing to compare
@@ -73,9 +84,20 @@ class LeftOut(NamedTuple):
         return of_poses, (count, self.length_ratio, 1.0, lengths if math.isfinite(lengths) else count)
 
     @property
-    def probabilities(self) -> list[float]:
-        """Of such errors of poses, and of lengths, by chance where the predictions are right; NaN where unknown."""
-        return [chance(*parts[1:], self.noise_degrees_of_freedom) for parts in self.comparisons]
+    def ratio(self) -> float:
+        """Mean square distance of the poses over the predicted one; NaN where nothing is predicted."""
+        usable = self.poses and 0 < self.rms_predicted < math.inf
+        return (self.rms / self.rms_predicted) ** 2 if usable else math.nan
+
+    def probabilities(self, between: BetweenGroups | None = None) -> list[float]:
+        """Of such errors of poses, and of lengths, by chance where the predictions are right; NaN where unknown.
+
+        ``between``: how the poses of other groups agree with their prediction.
+        """
+        poses, lengths = (
+            Agreement(int(part[0]), *part[1:], self.noise_degrees_of_freedom) for part in self.comparisons
+        )
+        return [poses.by_groups(between).probability, lengths.probability]
 
 
 class CrossValidation(NamedTuple):
@@ -125,6 +147,16 @@ class CrossValidation(NamedTuple):
         squares = sum(group.poses * getattr(group, name) ** 2 for group in counted)
         return math.sqrt(squares / sum(group.poses for group in counted)) if counted else math.nan
 
+    def between(self, without: int | None = None) -> BetweenGroups | None:
+        """How the poses of the groups agree with their prediction, or of all but one; None where there are too few."""
+        groups = [group for i, group in enumerate(self.groups) if i != without]
+        return BetweenGroups.of([group.ratio for group in groups], [group.comparisons[0][3] for group in groups])
+
+    @property
+    def probabilities(self) -> list[list[float]]:
+        """Of each group: of such errors of poses, and of lengths, by chance, as the other groups have shown it."""
+        return [group.probabilities(self.between(without=i)) for i, group in enumerate(self.groups)]
+
     @property
     def open(self) -> int:
         """How many groups the others cannot predict, because without them something is not determined."""
@@ -140,7 +172,7 @@ class CrossValidation(NamedTuple):
     def disagreeing(self) -> tuple[int, ...]:
         """Numbers, from 0, of the groups whose errors exceed their prediction by more than chance does in one case of
         two hundred, over all groups together; the most improbable first."""
-        probabilities = [[p for p in group.probabilities if math.isfinite(p)] for group in self.groups]
+        probabilities = [[p for p in of_group if math.isfinite(p)] for of_group in self.probabilities]
         least = {i: min(of_group) for i, of_group in enumerate(probabilities) if of_group}
         count = sum(map(len, probabilities))
         return tuple(i for i in sorted(least, key=least.__getitem__) if least[i] < _HALF / count)
@@ -150,12 +182,15 @@ class CrossValidation(NamedTuple):
         """Whether the errors of a group, or of all groups together, exceed their prediction by more than chance does
         in one case of a hundred."""
         pooled, of_noise = [], min(group.noise_degrees_of_freedom for group in self.groups)
-        for parts in zip(*(group.comparisons for group in self.groups), strict=True):
+        for parts, between in zip(
+            zip(*(group.comparisons for group in self.groups), strict=True), (self.between(), None), strict=True
+        ):
             usable = [part for part in parts if part[0] and part[3] > 0 and 0 < part[2] < math.inf]
             if usable:
                 # A sum of squares of independent parts with means T and degrees of freedom f has
                 # (sum T)^2 / sum (T^2 / f) of them (Satterthwaite).
                 count, rms, predicted, freedom = np.array(usable).T
+                freedom = freedom if between is None else between.scatter(freedom)
                 means = count * predicted**2
                 ratio = math.sqrt(np.sum(count * rms**2) / means.sum())
                 pooled.append(chance(ratio, 1.0, float(means.sum() ** 2 / np.sum(means**2 / freedom)), of_noise))

@@ -21,6 +21,7 @@ from ..data.observations.observation import OTHER_UNITS
 from ..model.elimination import flat, followed
 from ..model.observed import Observed, ends_of
 from ..uncertainty.arm_uncertainty import Uncertainty
+from ..uncertainty.between_groups import BetweenGroups
 from ..uncertainty.coverage import LEVEL
 from ..uncertainty.degrees_of_freedom import Law, coverage_factor, degrees_of_freedom
 from ..uncertainty.linear_propagation import Influence
@@ -61,6 +62,7 @@ class UnseenErrors(NamedTuple):
     length_parts: Float[np.ndarray, "l c"]  # variances of them by what they rest on, mm^2
     law: Law  # how well each part is known
     noise_degrees_of_freedom: float
+    between: BetweenGroups | None = None  # what groups that were held out have shown of such predictions
 
     @property
     def length_u(self) -> Float[np.ndarray, " l"]:
@@ -83,7 +85,7 @@ class UnseenErrors(NamedTuple):
             effective = whole.trace**2 / (whole.square + float(np.sum(both * both.T)))
         others = zip(whole.other_squares, whole.others, strict=True)
         rms_angle, rms_px = (math.sqrt(square / count) if count else math.nan for square, count in others)
-        return Agreement(
+        agreement = Agreement(
             count=whole.poses,
             rms=math.sqrt(whole.squares / whole.poses),
             predicted=math.sqrt(whole.trace / whole.poses),
@@ -93,6 +95,7 @@ class UnseenErrors(NamedTuple):
             rms_angle=rms_angle,
             rms_px=rms_px,
         )
+        return agreement.by_groups(self.between)
 
     def of_lengths(self, which: Iterable[int] | None = None) -> Agreement:
         """Some of the reference lengths, or all, as far as their errors can be predicted; both root mean squares weigh
@@ -135,7 +138,7 @@ def unseen_errors(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
     uncertainty, capture = to_numpy((to_numpy(uncertainty).complete, capture))
     problem, freedom = _Unseen.of(uncertainty, capture), uncertainty.scatter_degrees_of_freedom
     parts = {part.observation.name: _part_of(problem, number, part) for number, part in enumerate(problem.parts)}
-    return UnseenErrors(parts, problem.common, *_of_lengths(problem, capture), freedom)
+    return UnseenErrors(parts, problem.common, *_of_lengths(problem, capture), freedom, uncertainty.between)
 
 
 class _Unseen(NamedTuple):

@@ -16,7 +16,7 @@ from ..data.observations.observation import stated_u
 from ..data.recording import Recording
 from ..kinematics.arm import Arm, joint_limits, parameter_names, value_of
 from ..kinematics.corrected_arm import function_values
-from ..kinematics.corrections import Term
+from ..kinematics.correction_kinds import Term
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..solver.reason import MAX_STEPS, STALLED, Reason
 from ..uncertainty.arm_uncertainty import Uncertainty
@@ -190,12 +190,16 @@ class CalibrationRecord(NamedTuple):
         return vectors
 
     def evaluations(self) -> dict[str, Evaluation]:
-        """The three arms on the capture that was identified from."""
+        """The nominal arm, the arm as found (where that is known), that after stage 1 and the calibrated one on the
+        capture that was identified from."""
         capture, calibrated = self.recording.capture, evaluate(self.calibrated.arm, self.recording.capture)
         leaves = [jax.tree.leaves(specification.arm) for specification in (self.stage1, self.calibrated)]
         alike = len(leaves[0]) == len(leaves[1]) and all(map(np.array_equal, *leaves))
         stage1 = calibrated if alike else evaluate(self.stage1.arm, capture)
-        return {"nominal": evaluate(self.recording.nominal.arm, capture), "stage1": stage1, "calibrated": calibrated}
+        as_found = self.recording.as_found
+        before = {} if as_found is None else {"as_found": evaluate(as_found.arm, capture)}
+        nominal = evaluate(self.recording.nominal.arm, capture)
+        return {"nominal": nominal, **before, "stage1": stage1, "calibrated": calibrated}
 
 
 @checked_arguments
@@ -311,10 +315,12 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
         covariance, is_open, names = np.asarray(result.covariance), np.asarray(result.open), result.names
         u_k, surplus_k = None if np.isnan(result.u_k) else np.asarray(result.u_k), np.asarray(result.surplus_k)
         lengths = len(result.recording.capture.lengths)
+        between = None if result.validation is None else result.validation.between()
     else:
         arm, scale, names = result.arm, result.scale, result.space.names
         covariance, _, is_open, noise, components = result.parameter_covariance
         shared = None if isinstance(result, Identification) else result.shared
+        between = None
         u_k, surplus_k, lengths = (None, None, 0) if scale is None else (scale.u, scale.surplus, len(scale.nominal))
     # Parts of the covariance of the parameters, with errors of the tip that poses share.
     of_tips = None if shared is None else shared.of_tips
@@ -330,6 +336,7 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
         names=names,
         scatter_degrees_of_freedom=float(result.degrees_of_freedom),
         lengths=lengths,
+        between=between,
     )
 
 

@@ -2,8 +2,9 @@
 
 `solve` runs the least squares of a task in turn (`task.solves_of`; with a prior the last of them is repeated until the
 weights agree with what it leads to, `prior_fit`), and concludes: at the solution the problem is linear, with whitened
-rows w = w0 + A dx, so errors e of the rows move the unknowns by dx = -G A^T W e, where G is the inverse of the
-information A^T W A (`uncertainty.linear_propagation`). The covariance of the unknowns follows from that of the rows,
+rows w = w0 + A^T dx, so errors e of the rows move the unknowns by dx = -G A W e, where A has a row for each unknown
+(private geometry is eliminated from it: A~ of `model.elimination`), and G is the inverse of the information A W A^T
+(`uncertainty.linear_propagation`). The covariance of the unknowns follows from that of the rows,
 which is that of the given noise, or of noise estimated from the residuals.
 
 Example, of the parameters of stage 1 and their standard uncertainties:

@@ -100,19 +100,16 @@ def _check_evaluation(
 ) -> None:
     simulated = record.recording.true is not None
     if evaluation is None:
-        check_conformity(administrative_data, simulated=simulated)
-        if administrative_data.conformity is not None:
-            raise InputError(
-                "conformity is stated, but the certificate has no acceptance results to support it; give an "
-                "evaluation with limits (--evaluation), or remove [conformity]."
-            )
+        check_conformity(
+            administrative_data, simulated=simulated, needed="give an evaluation with limits (--evaluation)"
+        )
         return
     if not same_arm(record.calibrated.arm, evaluation.calibrated.arm):
         raise InputError("the evaluation belongs to another calibration; run aacmm evaluate with this calibration.")
     simulated |= evaluation.recording.true is not None
     tests = evaluation.acceptance()["calibrated"]
     decision = worst([test.decision for test in tests if test.decision is not None])
-    check_conformity(administrative_data, simulated=simulated, decision=decision, tested=True)
+    check_conformity(administrative_data, simulated=simulated, decision=decision)
 
 
 def _administrative(
@@ -226,19 +223,18 @@ def _acceptance_results(record: EvaluationRecord) -> Iterator[Element]:
     for stage, tests in record.acceptance().items():
         if not tests:
             continue
-        status = {"nominal": "beforeAdjustment", "calibrated": "afterAdjustment"}[stage]
         formulas = "Formulas and requirements are taken from secondary sources."
         contributions = (
             "The uncertainty includes only the contributions of the tester (ISO 14253-5), combined as independent "
             "contributions."
         )
         data = element("data", english("text", _influences(record)))
-        condition = named("influenceCondition", "Uncertainty of the test", element("status", status), data)
+        condition = named("influenceCondition", "Uncertainty of the test", xml.adjustment_status(stage), data)
         editions = dict.fromkeys(test.called for test in tests)
         evaluation = "Evaluation of the uncertainty of the tests"
         yield named(
             "measurementResult",
-            f"Acceptance tests, {stage} parameters",
+            f"Acceptance tests, {'parameters as found' if stage == 'as_found' else f'{stage} parameters'}",
             element(
                 "usedMethods",
                 (xml.method("Acceptance tests", formulas, edition) for edition in editions),

@@ -51,28 +51,35 @@ _MEASURED = {
 
 
 def results_of(record: CalibrationRecord, given: AdministrativeData, command: str) -> Iterator[Element]:
-    """Both measurement results of a calibration."""
+    """The measurement results of a calibration: by the nominal parameters, by those as found, where they are known,
+    and by the calibrated ones."""
     residuals, temperature = observation_residuals(record), english("text", NOT_STATED)
     if given.certificate.temperature_celsius is not None:
         celsius = real(given.certificate.temperature_celsius, xml.CELSIUS, given.certificate.temperature_u_celsius)
         temperature = named("quantity", "Ambient temperature", celsius)
-    for stage, status, says in (
-        ("nominal", "before", "The readings, evaluated with the nominal parameters (those before the calibration)."),
-        (
-            "calibrated",
-            "after",
+    stages = {
+        "nominal": ("Nominal parameters", "The readings, evaluated with the nominal parameters."),
+        "as_found": (
+            "Parameters as found",
+            "The same readings, evaluated with the parameters that were in the controller on arrival.",
+        ),
+        "calibrated": (
+            "Calibrated parameters",
             "The same readings, evaluated with the calibrated parameters, which were identified from these readings.",
         ),
-    ):
-        status, data = element("status", f"{status}Adjustment"), element("data", temperature)
+    }
+    for stage, (title, says) in stages.items():
+        if stage == "as_found" and record.recording.as_found is None:
+            continue
+        status, data = xml.adjustment_status(stage), element("data", temperature)
         yield named(
             "measurementResult",
-            f"{stage.capitalize()} parameters",
+            title,
             _methods(record, residuals),
             xml.software("usedSoftware", command),
             element("measuringEquipments", _equipment(record, given.reference, residuals)),
             element("influenceConditions", named("influenceCondition", "Ambient temperature", status, data)),
-            element("results", _results(record, stage == "calibrated", residuals)),
+            element("results", _results(record, stage, residuals)),
             says=says,
         )
 
@@ -184,9 +191,9 @@ def _equipment(
 
 
 def _results(
-    record: CalibrationRecord, calibrated: bool, residuals: tuple[ObservationResiduals, ...]
+    record: CalibrationRecord, stage: str, residuals: tuple[ObservationResiduals, ...]
 ) -> Iterator[Element | None]:
-    evaluation, uncertainty = record.evaluations()["calibrated" if calibrated else "nominal"], uncertainty_of(record)
+    evaluation, uncertainty, calibrated = record.evaluations()[stage], uncertainty_of(record), stage == "calibrated"
     values = {name: float(getattr(evaluation.repeatability, key)) for name, (key, _) in _METRICS.items()}
     if all(map(math.isfinite, values.values())):  # not where every socket has one pose
         quantities = (
@@ -203,7 +210,7 @@ def _results(
             for number, (part, of_arm) in enumerate(zip(residuals, distances, strict=True), start=1)
         )
         yield _result("Observations", "Distances of the tip from the geometry of each observation.", rows)
-    yield _parameters(record, calibrated, uncertainty)
+    yield _parameters(record, stage, uncertainty)
     if calibrated:
         yield _covariance(record)
     if calibrated and not math.isnan(record.k):
@@ -275,9 +282,11 @@ def _observation(number: int, part: ObservationResiduals, distances: np.ndarray,
     )
 
 
-def _parameters(record: CalibrationRecord, calibrated: bool, uncertainty: Uncertainty) -> Element:
+def _parameters(record: CalibrationRecord, stage: str, uncertainty: Uncertainty) -> Element:
     factors = dict(zip(record.names, map(float, uncertainty.factor(LEVEL)), strict=True))
-    arm = (record.calibrated if calibrated else record.recording.nominal).arm
+    recording, calibrated = record.recording, stage == "calibrated"
+    specification = record.calibrated if calibrated else recording.nominal
+    arm = (recording.as_found if stage == "as_found" and recording.as_found is not None else specification).arm
     names, quantities = parameter_names(arm), []
     for name, value in zip(names, np.asarray(Parameters(arm, names).vector()).tolist(), strict=True):
         note, u = _note_and_uncertainty(record, name) if calibrated else ("", None)

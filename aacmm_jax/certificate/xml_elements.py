@@ -46,6 +46,12 @@ def _put(parent: Element, child: Child) -> None:
             _put(parent, part)
 
 
+def adjustment_status(stage: str) -> Element | None:
+    """Whether results are those before or after the adjustment. Nominal parameters are neither, unless somebody says
+    that the arm arrived with them."""
+    return optional("status", {"as_found": "beforeAdjustment", "calibrated": "afterAdjustment"}.get(stage))
+
+
 def optional(tag: str, words: str | None) -> Element | None:
     """An element with a text; None where there is none."""
     return None if words is None else element(tag, words)

@@ -128,8 +128,9 @@ def calibrate(
         "Leave out a socket, placement or station that contradicts all others, even with --no-automatic.",
     ),
     automatic: bool = option(
-        "Widen default bounds that the fit reaches, leave out groups that contradict all others, and choose the model "
-        "of the joints that predicts held-out regions best. What is stated by options or the arm file stays as stated.",
+        "Use a prior if there are too few data, correct readings whose order, signs, zeros or units are wrong, widen "
+        "default bounds that the fit reaches, leave out groups that contradict all others, and choose the model of the "
+        "joints that predicts held-out regions best. What is stated by options or the arm file stays as stated.",
         default=True,
     ),
     residuals: Path | None = options.RESIDUALS,
@@ -316,7 +317,7 @@ def compare_models(
 
 
 @command(
-    "aacmm compare march.h5 september.h5",
+    "aacmm compare march.h5 september.h5 -o changes.h5",
     "aacmm compare 2023.h5 2024.h5 2025.h5 --figure trend.png --max-length-change-mm 0.05",
 )
 def compare(
@@ -337,17 +338,21 @@ def compare(
     max_length_change_mm: float | None = option(
         "Exit with code 1 if a length changes by more than this from the first calibration to the last.", min=0
     ),
+    output: Path | None = output(
+        "File to write the comparison to (HDF5); aacmm show and aacmm report read it.", "FILE.h5", None
+    ),
     as_json: bool = options.JSON,
 ) -> None:
     """Compare calibrations of one arm.
 
-    The command reports which parameters changed beyond their uncertainty, and how measured lengths change.
+    The command says whether the arm has changed, which parameters changed beyond their uncertainty, and how measured
+    lengths change; or from which size on a change would have been seen.
     """
     if len(paths) < 2:
         raise InputError(f"{paths[0]} alone cannot be compared; name at least two calibrations.")
     options.check_figure(figure)
     words = summaries.drift
-    with together(figure, csv):
+    with together(output, figure, csv):
         records = [files.load_calibration(path) for path in paths]
         created = [
             record.recording.measured or read_tables(path, ("calibration",)).attributes["created"]
@@ -363,7 +368,9 @@ def compare(
             plot.save_drift_trend(trend, figure)
         if csv is not None:
             write_text(csv, words.drift_csv(trend, labels))
-    written = ", ".join(str(path) for path in (figure, csv) if path is not None)
+        if output is not None:
+            files.save_comparison(output, summary, [fingerprint(InputFile(path)) for path in paths])
+    written = ", ".join(str(path) for path in (output, figure, csv) if path is not None)
     show_summary(summary | ({"written": written} if written else {}), as_json, words.comparison)
     if summary["failed"]:
         raise typer.Exit(1)

@@ -276,8 +276,15 @@ def _at_temperature(commanded: Any, calibrated: Any, temperature: float | None) 
     from ..data.capture_data import check_temperatures
     from ..files.manifest_readings import with_temperature
     from ..kinematics.arm import correction_names
-    from ..kinematics.corrections import Expansion
+    from ..kinematics.corrected_arm import loads_of
+    from ..kinematics.correction_kinds import Expansion
 
+    torques = calibrated.corrections is not None and calibrated.corrections.functions.by_torque
+    if torques and loads_of(calibrated) is None:
+        raise InputError(
+            "the arm was calibrated with measured torques, but those of commanded poses are unknown without masses; "
+            "calibrate with --model gravity, or with an arm whose masses are known."
+        )
     if Expansion.words[0] not in correction_names(calibrated):
         if temperature is not None:
             raise InputError("the arm was calibrated without thermal expansion; leave out --temperature.")

@@ -27,6 +27,11 @@ _KINDS = {
     "points": ("load_evaluation", "evaluation.points_summary", views.points),
 }
 
+_COMPARISONS = {
+    "model comparison": ("load_compared_models", "compared_models.compared_models"),
+    "comparison": ("load_comparison", "drift.comparison"),
+}
+
 
 @command(
     "aacmm evaluate calibration.h5 capture.h5 --mpe Deltam=0.05 --mpe E_Uni=0.025+L/40000",
@@ -148,7 +153,8 @@ def _points(manifest: Path) -> Any:
 @command("aacmm report calibration.h5 -o report.html")
 def report(
     file: Path = argument(
-        "File to write a report of: a calibration, evaluation, study or model comparison.", "FILE.h5"
+        "File to write a report of: a calibration, evaluation, study, model comparison or comparison of calibrations.",
+        "FILE.h5",
     ),
     output: Path = output(
         "File to write the report to: one HTML file, which can be read without a network connection.", "FILE.html"
@@ -171,8 +177,8 @@ def report(
 @command("aacmm show calibration.h5", "aacmm show panda")
 def show(
     file: str = argument(
-        "File to show: a capture, calibration, evaluation, study or model comparison (HDF5), or an arm (TOML file, "
-        "URDF, kinematics.yaml, or the name of an arm that ships with aacmm).",
+        "File to show: a capture, calibration, evaluation, study, model comparison or comparison of calibrations "
+        "(HDF5), or an arm (TOML file, URDF, kinematics.yaml, or the name of an arm that ships with aacmm).",
         "FILE",
     ),
     cell: int | None = option("Show all results of this cell of a study.", "N", min=1),
@@ -195,7 +201,7 @@ def show(
         raise InputError(
             f"--base and --tip name links of a URDF, but {file} is not a URDF; leave out --base and --tip."
         )
-    attributes, summary = read_summary(path, ("capture", "calibration", "evaluation", "study", "model comparison"))
+    attributes, summary = read_summary(path, (*_KINDS, "study", *_COMPARISONS))
     kind = attributes["kind"]
     if kind == "study":
         prepare_jax()
@@ -203,10 +209,11 @@ def show(
         return
     if cell is not None or figures is not None:
         raise InputError(f"{file} is not a study but a file of the kind '{kind}'; leave out --cell and --figures.")
-    if kind == "model comparison":  # whose tables hold all of it
+    if kind in _COMPARISONS:  # whose summary holds all of it
         prepare_jax()
-        summary, view = dict(files.load_compared_models(path)), summaries.compared_models.compared_models
-        show_summary(summary, as_json, view)
+        load, view = _COMPARISONS[kind]
+        module, _, function = view.partition(".")
+        show_summary(getattr(files, load)(path), as_json, getattr(getattr(summaries, module), function))
         return
     load, summarise, view = _KINDS["points" if attributes.get("of") == "points" else kind]
     if summary is None:  # of a file that was written through Python, or by another version

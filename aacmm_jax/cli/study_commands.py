@@ -12,7 +12,7 @@ from typing import Any
 from ..core.errors import InputError
 from ..files.outputs import together
 from . import INTERRUPTED, INTERRUPTED_SENTENCE, options
-from .app import Stopped, command, progress_bar, show_summary
+from .app import Stopped, command, progress_bar, show_summary, with_spinner
 from .options import argument, flag, option, output
 
 
@@ -50,9 +50,10 @@ def study(
     Repeat the command to continue a study that was interrupted.
     """
     from ..study.definition import Study
+    from ..study.results import study_summary
     from ..study.runner import dask_executor, run_study
     from ..study.sources import read_study
-    from ..study.store import read
+    from ..study.store import Results, read
 
     if resume and not os.path.exists(output):  # where `Path.exists` raises, of a name too long to be one
         raise InputError(
@@ -97,6 +98,7 @@ def study(
             "trials_done": outcome.done,
             "trials_this_run": outcome.ran,
             "finished": outcome.finished,
+            "finding": with_spinner("Summarising", lambda: study_summary(Results.of(output))["finding"]),
         }
         show_summary(summary, as_json, _ended)
         if not outcome.finished:
@@ -152,6 +154,7 @@ def _ended(summary: dict[str, Any]) -> list[str]:
     ran = f"{summary['trials_this_run']:,} trials run" if summary["trials_this_run"] else "no trials remained to be run"
     written = summary["written"]
     return [
+        *filter(None, [summary["finding"]]),
         f"Written: {written} ({summary['trials']:,} trials, {ran}).",
         f"Show the results with: aacmm show {written}",
     ]

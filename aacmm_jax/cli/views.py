@@ -13,7 +13,7 @@ from ..summaries.tables import Line, Styled, Table, View, decimals_for, formatte
 from ..uncertainty.coverage import LEVEL_IN_PERCENT, U_AT_LEVEL
 
 _MOST_PARTS = 12  # rows of a table
-_ARMS = {"nominal": "nominal", "calibrated": "calibrated"}
+_ARMS = {stage: words for stage, words in STAGES.items() if stage != "stage1"}
 _GROUPS = {
     "held_out": "Held-out data, which were not used for the calibration",
     "identified_from": "Data used for identification",
@@ -101,6 +101,9 @@ def capture(summary: dict[str, Any]) -> View:
     ends = {end: end if slides else f"{end} [deg]" for end in ("lowest", "highest")}
     columns = {heading: lambda row, end=end: reading(row, end) for end, heading in ends.items()}
     yield listed("Readings", summary["ranges"], {"joint": "joint"} | columns)
+    if summary["largest_torques_Nm"] is not None:
+        torques = ", ".join(f"{torque:.3g}" for torque in summary["largest_torques_Nm"])
+        yield f"Largest torques of the joints: {torques} N m."
     if summary["temperature_C"] is not None:
         low, high = summary["temperature_C"]
         yield f"Temperature: {low:.2f} to {high:.2f} C."
@@ -111,9 +114,9 @@ def capture(summary: dict[str, Any]) -> View:
 
 
 def calibration(summary: dict[str, Any]) -> View:
-    """One calibration: warnings first."""
-    yield solve(summary)
+    """One calibration: what it is good for first, then warnings."""
     yield from words.verdict_of(summary)
+    yield solve(summary)
     if summary.get("lengths_tested"):
         yield words.lengths_sentence(summary["lengths_tested"])
     yield from (f"Decided by default: {decision}" for decision in summary["decisions"])
@@ -248,6 +251,11 @@ def _uncertainty(summary: dict[str, Any]) -> View:
 
 def demo(summary: dict[str, Any]) -> View:
     """The demonstration: nominal arm, stage 1 and calibrated arm against the truth."""
+    before, after = (summary[stage]["check_rms_mm"] for stage in ("nominal", "calibrated"))
+    yield Styled(
+        f"Calibrated: lengths of {summary['check_length_mm']:g} mm are measured with an error of {after:.2g} mm RMS, "
+        f"where the nominal arm has {before:.2g} mm."
+    )
     yield (
         "Simulated arm of Cheng et al. 2018: its parameters differ from the nominal ones by up to "
         f"{summary['deviation_mm']:g} mm and {summary['deviation_deg']:g} deg; the noise is "
@@ -260,8 +268,9 @@ def demo(summary: dict[str, Any]) -> View:
         "Deltam, largest half range [mm]": "deltam_mm",
         f"RMS error of {summary['checks']} lengths of {summary['check_length_mm']:g} mm [mm]": "check_rms_mm",
     }
-    cells = [(text, *(summary[stage][key] for stage in STAGES)) for text, key in rows.items()]
-    yield listed("Lengths and repeatability", cells, ("", *STAGES.values()))
+    stages = {stage: words for stage, words in STAGES.items() if stage in summary}
+    cells = [(text, *(summary[stage][key] for stage in stages)) for text, key in rows.items()]
+    yield listed("Lengths and repeatability", cells, ("", *stages.values()))
     yield tables.truth_table(summary)
     yield (
         f"k = {summary['scale_k']:.7f}, u(k) = {summary['scale_u']:.1e}: stage 1 uses repeatability only, so all "
@@ -296,8 +305,8 @@ def lengths(rows: Sequence[Mapping[str, Any]], *, fixed_scale: bool = False, pre
 
 def evaluation(summary: dict[str, Any]) -> View:
     """One evaluation: decisions first, then held-out data, since they are what counts."""
-    yield Styled(summary["arm"])
     yield from words.verdict_of(summary)
+    yield Styled(summary["arm"])
     yield from words.warnings_of(summary)
     yield from words.limits_of(summary)
     if summary["acceptance"] or summary["standards"]:
@@ -356,10 +365,10 @@ def report(summary: dict[str, Any]) -> View:
 
 
 def points(summary: dict[str, Any]) -> View:
-    """Acceptance tests of points."""
+    """Acceptance tests of points: the decision first."""
     counts = (pluralise(summary[f"{noun}s"], noun) for noun in ("socket", "length", "sphere"))
-    yield f"{pluralise(summary['points'], 'point')}: {', '.join(counts)}"
     yield from words.verdict_of(summary)
+    yield f"{pluralise(summary['points'], 'point')}: {', '.join(counts)}"
     yield from words.warnings_of(summary)
     yield from _acceptance(summary)
     yield from words.written_of(summary)

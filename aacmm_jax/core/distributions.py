@@ -52,6 +52,16 @@ def f_tail(value: float, numerator: float, denominator: float) -> float:
     return float(_special().fdtrc(numerator, denominator, value))
 
 
+def detectable(rank: float, degrees_of_freedom: float, level: float, power: float) -> float:
+    """Noncentrality from which a test at 1 - level finds a change with this probability: a chi-square test of so many
+    combinations, or an F test where the variances have finite degrees of freedom."""
+    special = _special()
+    if np.isinf(degrees_of_freedom):
+        return float(special.chndtrinc(special.chdtri(rank, 1 - level), rank, 1 - power))
+    limit = special.fdtri(rank, degrees_of_freedom, level)
+    return float(special.ncfdtrinc(rank, degrees_of_freedom, 1 - power, limit))
+
+
 def chance(rms: float, predicted: float, degrees_of_freedom: float, of_prediction: float) -> float:
     """Probability of a root mean square of at least ``rms`` where ``predicted`` is right, by the F distribution; by
     the chi-square distribution where the prediction is exact (infinite degrees of freedom). NaN where it is unknown."""

@@ -17,6 +17,7 @@ from ..core.numpy_or_jax import AnyArray, namespace
 from ..core.random_keys import random_generator
 from ..core.text import shorten
 from ..kinematics.arm import Arm
+from ..kinematics.chain import beside_joints
 from .capture_data import (
     NOTHING_REPEATED,
     UNKNOWN,
@@ -337,8 +338,8 @@ def check_one_capture(capture: Capture) -> None:
 
 def check_readings(capture: Capture, arm: Arm, *, advice: str = "convert with numpy.deg2rad") -> None:
     """Raise `InputError` where known readings of an arm's revolute joints look like degrees, with advice on them."""
-    joints, columns = arm.joints, arm.columns
     for part in capture.parts:
-        if is_concrete(part.q) and part.q.shape[-1] in (joints, columns):
-            check_temperatures(described(part), np.asarray(part.q)[..., joints:])
+        if is_concrete(part.q) and part.q.shape[-1] in arm.possible_columns:
+            temperature = beside_joints(arm.joints, part.q.shape[-1])[1]
+            check_temperatures(described(part), np.asarray(part.q)[..., temperature])
             check_revolutions(described(part), part.q, arm, advice)

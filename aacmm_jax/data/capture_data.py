@@ -13,7 +13,7 @@ from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray
 from ..core.text import pluralise, shorten
 from ..kinematics.arm import Arm, by_joint
-from ..kinematics.corrections import REFERENCE_TEMPERATURE
+from ..kinematics.correction_kinds import REFERENCE_TEMPERATURE
 from .observations.declared import checked_name, checked_readings
 from .observations.held import Socket, sockets_of
 from .observations.observation import AbstractObservation

@@ -72,6 +72,8 @@ class Recording(NamedTuple):
         acceptance: Standards whose acceptance procedure the poses were taken for: "jjf", "asme", "iso".
         measuring_range: Diameter of the measuring volume as the arm's maker states it, mm; None where not stated.
         usual: Noise that the arm's file states, with which an estimated one is compared; None where it states none.
+        as_found: The arm with the parameters that its controller had on arrival; None where they are not known. The
+            nominal arm is not it, unless somebody says so.
 
     Example:
         >>> recorded = aj.Recording(capture, nominal, measured="2026-01-31")
@@ -89,3 +91,4 @@ class Recording(NamedTuple):
     acceptance: tuple[str, ...] = ()
     measuring_range: float | None = None
     usual: ArmNoise | None = None
+    as_found: ArmSpecification | None = None

@@ -15,7 +15,8 @@ from ..core.random_keys import random_generator, random_key, random_numbers
 from ..core.units import ARCSEC
 from ..kinematics.arm import Arm, is_single, joint_limits
 from ..kinematics.chain import length_scale
-from ..kinematics.corrections import REFERENCE_TEMPERATURE
+from ..kinematics.corrected_arm import holding_torques
+from ..kinematics.correction_kinds import REFERENCE_TEMPERATURE
 from ..kinematics.inverse_kinematics import random_configurations
 from .capture import Capture
 from .capture_data import ReferenceLength, check_temperatures
@@ -129,21 +130,22 @@ class _Recorder(NamedTuple):
     def configurations(
         self, holding: Arm, points: Float[np.ndarray, "m 3"], reach_key: Array, seat_key: Array, labels: Sequence[str]
     ) -> Float[np.ndarray, "m columns"]:
-        """Random configurations of an arm at points, where the seat lets it be; with the temperature of each."""
+        """Random configurations of an arm at points, where the seat lets it be; with torques and temperatures."""
         targets = points + self.noise.seating * random_numbers("normal", seat_key, points.shape)
         low, high = self.temperatures
         temperature = self.random.uniform(low, high, (len(labels), int(holding.thermometer)))
         at_zero = np.concatenate([np.zeros((len(labels), holding.joints)), temperature], axis=1)
         targets = targets / length_scale(holding.geometry, at_zero)[:, None]
         angles = random_configurations(holding, targets, reach_key, self.limits, labels=labels)
-        return np.concatenate([angles, temperature], axis=1)
+        torques = [holding_torques(holding, np.asarray(angles))] if holding.torques else []
+        return np.concatenate([angles, *torques, temperature], axis=1)
 
     def read(self, q: Float[np.ndarray, "m columns"], key: Array) -> Float[np.ndarray, "m columns"]:
-        """What the encoders show; a thermometer is exact."""
-        angles, temperature = q[:, : self.arm.joints], q[:, self.arm.joints :]
+        """What the encoders show; torques and temperatures are exact."""
+        angles, beside = q[:, : self.arm.joints], q[:, self.arm.joints :]
         shown = angles + self.noise.of_readings(self.arm.geometry.kinds) * random_numbers("normal", key, angles.shape)
         step = np.where(self.step > 0, self.step, 1.0)
-        return np.concatenate([np.where(self.step > 0, np.round(shown / step) * step, shown), temperature], axis=1)
+        return np.concatenate([np.where(self.step > 0, np.round(shown / step) * step, shown), beside], axis=1)
 
     def recorded(self, simulated: AbstractSimulated, key: Array) -> AbstractObservation:
         """One simulated observation."""

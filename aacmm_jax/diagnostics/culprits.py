@@ -26,7 +26,7 @@ from .equations import Block, Rows, wider
 from .findings import Case, by_equations, rounded
 from .hypotheses import fixed_text, pose_names, shifted_seats, steps
 from .missing_terms import FoundTerm, columns_of, missing_terms
-from .possible_causes import Cause, of_certified, of_functions, of_variances, of_parameters
+from .possible_causes import Cause, of_certified, of_functions, of_parameters, of_variances
 from .residual_tests import LEVEL, Candidates, Residuals, ScoreTest
 
 MOST_CAUSES = 6  # that are looked for one after the other

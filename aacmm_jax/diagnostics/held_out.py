@@ -26,7 +26,7 @@ def contradicted_prediction(validation: CrossValidation) -> list[Finding]:
     count, texts = len(validation.disagreeing), []
     for i in validation.disagreeing:  # the most improbable ones first, by their poses, or else their lengths
         label, group = validation.labels[i], validation.groups[i]
-        poses, lengths = group.probabilities
+        poses, lengths = validation.probabilities[i]
         if not lengths < poses:
             ratio = group.rms / group.rms_predicted
             texts.append(f"{label} ({group.rms:.3g} mm RMS, {ratio:.1f} times the predicted value)")

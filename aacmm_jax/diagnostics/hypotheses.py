@@ -17,7 +17,8 @@ from ..kinematics.arm import Arm, by_joint, is_length
 from ..kinematics.chain import forward_pass, joint_motion
 from .missing_terms import MissingTerm
 
-_STEPS = 24  # poses at which something may change, evenly chosen: between two of these, little of the gain is lost
+_STEPS = 16  # poses at which something may change, evenly chosen: between two of these, little of the gain is lost
+_LOADS = 2  # of these, every so many for the load, which has many functions
 _STEPS_OF_GROUP = 6
 _FEWEST = 6  # poses on each side of a step
 _FEWEST_OF_GROUP = 3
@@ -48,9 +49,9 @@ def steps(
     terms = []
     places = np.unique(np.linspace(_FEWEST, len(q) - _FEWEST, _STEPS).astype(int))
     if near is not None:
-        between = len(q) // _STEPS + 1
+        between = (_LOADS if near.kind == "payload" else 1) * (len(q) // _STEPS + 1)
         places = np.arange(near.first - between, near.first + between + 1)
-    for first in (int(place) for place in places if 0 < place < len(q)):
+    for number, first in enumerate(int(place) for place in places if 0 < place < len(q)):
         later, after = (np.arange(len(q)) >= first).astype(float)[:, None], f"from {names[first]} on"
         for joint in range(1, arm.joints + 1):
             follows, concerns = f"a step of the zero of joint {joint} {after}", f"joint {joint}"
@@ -62,7 +63,7 @@ def steps(
         ):
             columns = later[:, :, None] * columns
             terms.append(MissingTerm(kind, None, columns, follows=f"{follows} {after}", cause=cause, first=first))
-        for load in gravity:
+        for load in gravity if near is not None or number % _LOADS == 0 else ():
             follows = f"a change of the load on joint {load.joint} {after}"
             cause = "a payload that was put on or taken off"
             loaded = load._replace(kind="payload", values=later * load.values, first=first)

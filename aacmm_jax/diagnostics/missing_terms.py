@@ -17,7 +17,8 @@ from ..core.numpy_or_jax import to_numpy
 from ..kinematics.arm import DOWN, Arm
 from ..kinematics.chain import forward_pass, joint_motion
 from ..kinematics.corrected_arm import function_values
-from ..kinematics.corrections import KINDS, Term, all_sought, model_of, model_with, terms_of
+from ..kinematics.correction_kinds import Term
+from ..kinematics.corrections import KINDS, all_sought, model_of, model_with, terms_of
 from .equations import Rows
 from .residual_tests import ScoreTest
 

@@ -291,6 +291,10 @@ def noise_by_joint(case: Case) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
         seating=float(record.noise.seating) if given else np.sqrt(now.variances[-1]),
         linear_encoder=None if kinds is None else np.where(kinds.mask(), sd, 0.0),
     )
+    try:
+        noise.check(joints)
+    except InputError:  # more than any encoder has: poses that hardly see the joint do not determine its noise
+        return None
     encoders = []
     for test, i, u_log in zip(noisy, index, u, strict=False):
         # u of a standard deviation is half of it times u of its log variance.

@@ -93,14 +93,18 @@ class OneVariance(NamedTuple):
     log_likelihood: float  # its maximum over that without the effect
 
 
-def one_variance(effects: Effects, columns: Float[np.ndarray, "R c"], usual: float) -> OneVariance:
+def one_variance(
+    effects: Effects, columns: Float[np.ndarray, "R c"], usual: float, probability: float = 1.0
+) -> OneVariance:
     """The variance of one more effect, with its posterior distribution.
 
-    Beforehand the standard deviation has a half-Cauchy distribution: as probable anywhere below what is ``usual``, and
-    less and less above, which few data would not exclude (Gelman 2006, Bayesian Analysis 1, 515-534, section 7, for
-    just such effects of a few groups). What residuals show is the sum of the effect and of the independent errors in
-    its place; stated is the geometric mean of that sum, less the errors. Intervals do not follow from it alone, but
-    from the whole distribution (`degrees_of_freedom`).
+    Beforehand there is such an effect with a ``probability``, and its standard deviation then has a half-Cauchy
+    distribution: as probable anywhere below what is ``usual``, and less and less above, which few data would not
+    exclude (Gelman 2006, Bayesian Analysis 1, 515-534, section 7, for just such effects of a few groups; with a
+    probability of one half, Jeffreys' prior of a test for an effect: 1961, Theory of Probability, section 5.2). What
+    residuals show is the sum of the effect and of the independent errors in its place; stated is the geometric mean of
+    that sum, less the errors. Intervals do not follow from it alone, but from the whole distribution
+    (`degrees_of_freedom`).
 
     ``columns`` are those of the effect, as far as the model does not explain them; ``usual`` is in mm.
     """
@@ -115,9 +119,13 @@ def one_variance(effects: Effects, columns: Float[np.ndarray, "R c"], usual: flo
     of_errors = variance / ratio / np.mean(values)
     of_cost = cost - total if effects.given else freedom * np.log(cost / total)
     likelihood = -0.5 * (of_cost + log_sum)
-    weight = likelihood + 0.5 * np.log(variance) - np.log1p(variance / usual**2)
-    weight = np.exp(weight - weight.max())
+    weight = likelihood + 0.5 * np.log(variance / usual**2) - np.log1p(variance / usual**2)
+    highest = max(float(weight.max()), 0.0)  # without the effect, the logarithm of the likelihood is 0
+    # Half-Cauchy by the logarithm of the standard deviation; the last is that there is no effect.
+    share = probability * 2 / np.pi * np.log(_RANGE[1] / _RANGE[0]) / (_GRID - 1)
+    weight = np.append(share * np.exp(weight - highest), (1 - probability) * np.exp(-highest))
     weight = weight / weight.sum()
+    variance, of_errors = np.append(variance, 0.0), np.append(of_errors, effects.variance / np.mean(values))
     stated = float(np.exp(weight @ np.log(variance + of_errors)) - weight @ of_errors)
     stated = max(stated, float(variance[0]))
     return OneVariance(stated, variance / stated, weight, float(np.max(likelihood)))
@@ -234,7 +242,7 @@ def with_lengths(problem: SharedProblem, relations: list[Block]) -> SharedProble
 
     Fixed lengths or a prior may contradict the scale of all lengths, which errors of single places do not explain.
     """
-    record, lengths, whitening = problem.record, problem.record.recording.capture.lengths, None
+    record, lengths, whitening, related = problem.record, problem.record.recording.capture.lengths, None, None
     blocks = [*(part.block("") for part in problem.rows), *relations]
     first = sum(part.residual.size for part in problem.rows)
     by_scale = np.array([float(length.value) / max(float(length.u), LEAST_U) for length in lengths])
@@ -257,8 +265,11 @@ def with_lengths(problem: SharedProblem, relations: list[Block]) -> SharedProble
             pairs = zip(blocks, parts, strict=True)
             blocks = [block._replace(shared=np.column_stack([block.shared, part])) for block, part in pairs]
     left = Residuals.of(blocks)
-    column = np.zeros((len(left.values), 1))
-    column[first : first + len(by_scale), 0] = by_scale
-    if np.linalg.norm(left.unexplained(column)) > _EXPLAINED * np.linalg.norm(column):
-        left = left.extended(column)
+    if related is None or related.scale is None:
+        # Beside a scale anchor, the scale of the lengths is no further unknown: what the anchor leaves of it is along
+        # the residuals of the lengths, which it would take away.
+        column = np.zeros((len(left.values), 1))
+        column[first : first + len(by_scale), 0] = by_scale
+        if np.linalg.norm(left.unexplained(column)) > _EXPLAINED * np.linalg.norm(column):
+            left = left.extended(column)
     return problem._replace(left=left, lengths=whitening)

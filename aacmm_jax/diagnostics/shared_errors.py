@@ -4,7 +4,7 @@ Looked for are, each only where a test of the residuals says so with a probabili
 all poses of a visit share (marked in the capture, or successive poses where none are), and functions of the readings
 that the model lacks (`uncertainty.covariance`). The gate keeps the intervals of a calibration in which nothing is
 wrong as they are. Errors that all poses of a socket share, which only reference lengths show, are always allowed for
-where three lengths or more compare them, as far as these leave them possible. After a robust loss, poses count with the
+where two lengths or more compare them, as far as these leave them possible. After a robust loss, poses count with the
 weights of the solution, as if these were given, and bad ones, which lost most of it, not at all.
 """
 
@@ -20,7 +20,6 @@ from jaxtyping import Float
 from ..calibration.redrawn import functions_of, places_of
 from ..calibration.results import Calibration
 from ..calibration.stages import Sensitivities
-from ..core.distributions import chi_square_tail, f_tail
 from ..core.numpy_or_jax import to_numpy
 from ..kinematics.arm import Arm, correction_names, natural_steps
 from ..kinematics.corrected_arm import with_corrections, with_further_corrections
@@ -51,7 +50,6 @@ _MOST_PATTERNS = 8  # of successive poses of one socket: slower ones matter, fas
 # Part of the residuals of poses above which the size of the arm explains them, to which residuals of sockets are in
 # proportion: parameters, or errors of places, of which poses say nothing.
 _MOST_OF_POSES = 0.5
-_NEIGHBOURS = 1.0  # rad, over which errors of neighbouring configurations are alike
 # Of the weight of a pose after a robust loss: less remains beyond 13 standard deviations with Huber, 4 with Tukey.
 # Shared errors of a few standard deviations cost weight, too, and are what is looked for.
 _TRUSTED = 0.1
@@ -59,9 +57,10 @@ _FEWEST = 6  # degrees of freedom
 # Median of the standard deviation of errors of the tip that poses share, of that of the residuals, as it is expected
 # beforehand; three lengths say so little that it decides how wide intervals are (`benchmarks/NOTES.md`).
 _USUAL = 1.25
-# Differences between lengths from which errors of places are always allowed for. So few do not show that there are
-# none: with three lengths, a gate closes in a third of the captures in which places err by as much as single poses.
-_FEW = 2
+# Probability beforehand that places err at all: even odds where several differences between lengths show them. A single
+# difference (two lengths) may as well be that of one wrong length, and says so little that with even odds U would be
+# several times too large in one sound capture of ten (`benchmarks/NOTES.md`).
+_SEVERAL, _ONE_DIFFERENCE = 0.8, 0.2
 
 
 def amend(result: Calibration, case: Case, sensitivities: Callable[[], Sensitivities]) -> Calibration:
@@ -107,11 +106,16 @@ class _Tips(NamedTuple):
 
 
 def _tips(
-    problem: SharedProblem, effects: Effects, kind: str, candidates: dict[float, Float[np.ndarray, "M c"]]
+    problem: SharedProblem,
+    effects: Effects,
+    kind: str,
+    candidates: dict[float, Float[np.ndarray, "M c"]],
+    probability: float = 1.0,
 ) -> _Tips:
-    """The most likely of some patterns, with their variance; usually it is about as large as that of single poses."""
+    """The most likely of some patterns, with their variance; usually it is about as large as that of single poses.
+    ``probability``: that there are such errors, beforehand."""
     usual = _USUAL * residual_rms(problem.rows)
-    fits = [one_variance(effects, problem.moved(patterns), usual) for patterns in candidates.values()]
+    fits = [one_variance(effects, problem.moved(patterns), usual, probability) for patterns in candidates.values()]
     best = int(np.argmax([fit.log_likelihood for fit in fits]))
     length = list(candidates)[best]
     return _Tips(kind, fits[best], candidates[length], length)
@@ -322,28 +326,5 @@ def _places(problem: SharedProblem, effects: Effects) -> _Tips | None:
     whole = float(effects.product(by_poses[:, None], by_poses[:, None])[0, 0])
     if not number or np.sum(squares / values) > _MOST_OF_POSES * whole:
         return None
-    if number < _FEW:
-        square = float(np.sum(effects.spectrum(columns, r)[1] / values))
-        freedom = effects.left.degrees_of_freedom - number
-        if effects.given:
-            probability = chi_square_tail(square, number)
-        else:
-            rest = max(float(effects.product(r[:, None], r[:, None])[0, 0]) - square, 1e-300)
-            probability = f_tail(square / number / (rest / freedom), number, freedom)
-        if not len(effects.variances):
-            probability = min(probability, _chance_of_neighbours(problem))
-        if probability >= _GATE:
-            return None
-    return _tips(problem, effects, PLACES, {np.nan: patterns})
-
-
-def _chance_of_neighbours(problem: SharedProblem) -> float:
-    """Probability that poses of one socket at neighbouring configurations err so much alike by chance."""
-    q = np.asarray(problem.record.recording.capture.readings)
-
-    def near(part: Rows) -> np.ndarray:
-        apart = q[part.poses][:, None] - q[part.poses]
-        distance = np.sqrt(np.sum(4 * np.sin(apart / 2) ** 2, axis=2))
-        return np.exp(-distance / _NEIGHBOURS) - np.eye(len(distance))
-
-    return _chance_of_alike(problem, near)
+    probability = _ONE_DIFFERENCE if number == 1 else _SEVERAL
+    return _tips(problem, effects, PLACES, {np.nan: patterns}, probability)

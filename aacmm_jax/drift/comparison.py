@@ -56,7 +56,7 @@ def compare(
         >>> print([name for name, moved in zip(changed.names, changed.moved) if moved])
         ['probe_z']
         >>> print(changed.sentences()[0][:60])
-        Probe remounted: a change of the probe alone (probe_x by -0.
+        The probe was remounted (probe_x by -0.905 um, probe_y by +0
     """
     return _compared([old, new], labels, level, (points, length, seed))[0]
 

@@ -58,8 +58,13 @@ class Drift(NamedTuple):
         return (1 - self.level) * self.compared
 
     def sentences(self) -> list[str]:
-        """Warnings and findings."""
-        return [*self.warnings, *self.findings()]
+        """Warnings, the answer and findings."""
+        return [*self.warnings, self.answer, *self.findings()]
+
+    @property
+    def answer(self) -> str:
+        """Whether the arm has changed, in what and by how much; or from which size on a change would have been seen."""
+        return f"Doubtful, see the warnings: {_answer(self)}" if self.warnings else _answer(self)
 
     def findings(self) -> list[str]:
         """What was found: of all parameters together, of each, of lengths, and of parameters without uncertainty."""
@@ -114,6 +119,46 @@ class Trend(NamedTuple):
     def warnings(self) -> list[str]:
         """What makes the comparisons doubtful, each sentence once."""
         return list(dict.fromkeys(sentence for drift in self.drifts for sentence in drift.warnings))
+
+
+def _answer(drift: Drift) -> str:
+    test, probe, lengths = drift.joint_test, drift.joint_test.probe, drift.lengths
+    if math.isnan(test.p):
+        return "Whether the arm has changed cannot be said: too few parameters are determined in both calibrations."
+    if test.p >= 1 - drift.level:
+        return f"No change of the arm is seen.{_detectable(drift)}"
+    if probe is not None and probe.remounted:
+        change = ", ".join(f"{name} by {in_words('mm', value)}" for name, value in probe.change)
+        rest = "has not changed" if not probe.p < 1 - drift.level else "may have changed slightly"
+        return f"The probe was remounted ({change}); the arm {rest}."
+    units = dict(zip(drift.names, drift.units, strict=True))
+    causes = [f"{_quantity(name)} by {in_words(units[name], amount)}" for name, amount in test.causes]
+    what = ", ".join(causes) or f"{int(drift.moved.sum())} of {drift.compared} parameters by more than their U"
+    return f"The arm has changed: {what}; lengths of {lengths.length:g} mm by up to {abs(lengths.largest):.2g} mm."
+
+
+def _quantity(name: str) -> str:
+    """A parameter as people name it."""
+    kind, _, joint = name.partition("_")
+    return f"zero of joint {joint}" if kind == "theta" else name
+
+
+def _detectable(drift: Drift) -> str:
+    """From which size on a change of one zero, or of one length of the arm, would have been seen, in words."""
+    test, units, ends = drift.joint_test, dict(zip(drift.names, drift.units, strict=True)), {}
+    for what, unit, kinds in (("zero of a joint", "rad", ("theta",)), ("length of the arm", "mm", ("a", "d"))):
+        sizes = [
+            size
+            for name, size in zip(test.names, test.detectable.tolist(), strict=True)
+            if name.partition("_")[0] in kinds and units[name] == unit and math.isfinite(size)
+        ]
+        if sizes:
+            ends[what] = [in_words(unit, end, "") for end in (min(sizes), max(sizes))]
+    if not ends:
+        return ""
+    every = " or ".join(f"one {what} had changed by {largest}" for what, (_, largest) in ends.items())
+    least = " and ".join(smallest for smallest, _ in ends.values())
+    return f" A change would have been seen in 95 of 100 cases if {every}; of the most certain ones, if by {least}."
 
 
 def _of_all(drift: Drift) -> str:

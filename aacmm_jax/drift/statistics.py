@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..calibration.record import CalibrationRecord, uncertainty_of
-from ..core.distributions import chi_square_tail, f_tail
+from ..core.distributions import chi_square_tail, detectable, f_tail
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
 from ..kinematics.arm import is_length
 from ..uncertainty.arm_uncertainty import Uncertainty
@@ -21,6 +21,7 @@ _PROBE_POSES = 60
 FIXED, ON_BOUND = "fixed", "on a bound"  # reasons for which a parameter takes no part in the joint test
 _OPEN = 1e-5  # a combination with a larger component along open directions is not determined: see `uncertainty`
 _MOST_CAUSES = 4
+_POWER = 0.95  # with which a change that is called detectable is found
 _SINGULAR = 1e-12  # relative to the largest eigenvalue of a correlation matrix: below, a combination has no variance
 
 
@@ -47,6 +48,9 @@ class JointTest(NamedTuple):
     # their changes (mm, rad); empty if a few do not suffice.
     causes: tuple[tuple[str, float], ...]
     probe: ProbeTest | None = None  # where chance does not explain the statistic
+    # Of each parameter that takes part: from which change on the test would find it in 95 % of cases, if nothing else
+    # changed; mm, rad or the coefficient's unit, infinite where none would be found.
+    detectable: Float[np.ndarray, " q"] = np.zeros(0)
 
 
 class LengthChange(NamedTuple):
@@ -138,7 +142,15 @@ def joint_test(
     if p < 1 - level:
         of_probe = columns @ (_changes_of_probe(new, tested) / steps[:, None])
         probe = _probe_test(whitened, of_probe, columns, probability)
-    return JointTest(statistic, rank, freedom, p, tested, named, probe)
+    sizes = _detectable(columns, rank, freedom, level) * steps
+    return JointTest(statistic, rank, freedom, p, tested, named, probe, sizes)
+
+
+def _detectable(columns: Float[np.ndarray, "r p"], rank: int, freedom: float, level: float) -> np.ndarray:
+    """Changes of single parameters that the test finds in 95 % of cases, in steps: a change by one step has the
+    noncentrality of the sum of squares of its column."""
+    with np.errstate(divide="ignore"):
+        return np.sqrt(detectable(rank, freedom, level, _POWER) / np.sum(columns**2, axis=0))
 
 
 def _steps(names: Sequence[str]) -> Float[np.ndarray, " p"]:

@@ -13,6 +13,8 @@ from .captures import load_capture as load_capture
 from .captures import save_capture as save_capture
 from .cells import load_cell as load_cell
 from .cells import read_kit as read_kit
+from .comparisons import load_comparison as load_comparison
+from .comparisons import save_comparison as save_comparison
 from .controllers import dh_table as dh_table
 from .controllers import python_program as python_program
 from .controllers import ur_kinematics_yaml as ur_kinematics_yaml

@@ -168,17 +168,23 @@ def read_administrative_data(path: str | os.PathLike) -> AdministrativeData:
 
 
 def check_conformity(
-    about: AdministrativeData, *, simulated: bool, decision: str | None = None, tested: bool = False
+    about: AdministrativeData, *, simulated: bool, decision: str | None = None, needed: str = ""
 ) -> None:
-    """Refuse a statement of conformity that the data contradict: of a simulated arm, or against an evaluation."""
+    """Refuse a statement of conformity of a simulated arm, one without a test in the file (``needed``: what would be
+    one), and one that contradicts the decision of the tests."""
     if about.conformity is None:
         return
     verdict = about.conformity.verdict
     if simulated:
         raise InputError("conformity cannot be stated for a simulated arm; remove [conformity].")
+    if needed:
+        raise InputError(
+            f"conformity is stated, but there are no acceptance results to support it; {needed}, or remove "
+            "[conformity]."
+        )
     results = {"conforms": "every limit is met", "fails": "a limit is not met", "undecided": "a limit is undecided"}
     passes = {"pass": ("conforms",), "fail": ("fails",)}.get(verdict, tuple(results))
-    if tested and decision not in passes:
+    if decision not in passes:
         raise InputError(
             f"conformity.verdict is '{verdict}', but in this evaluation "
             f"{results.get(decision or '', 'no limit was given')}; correct the verdict."

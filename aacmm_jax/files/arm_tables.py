@@ -105,9 +105,14 @@ class CorrectionsTable(Strict):
                 "exactly one of model and coefficients is needed; give model = 'gravity,harmonics=1', for example, or "
                 "the coefficients by name."
             )
-        if self.mass is not None and self.model is not None and "gravity=masses" not in self.model:
+        if (
+            self.mass is not None
+            and self.model is not None
+            and not {"gravity=masses", "torque"} & {kind.strip() for kind in self.model.split(",")}
+        ):
             raise ValueError(
-                "the keys mass and centre apply only to model = 'gravity=masses'; write this model, or remove the keys."
+                "the keys mass and centre apply only to the models gravity=masses and torque; write one of these, or "
+                "remove the keys."
             )
         if self.nominal and not self.coefficients:
             raise ValueError("the key nominal applies only to coefficients, but a model is given; remove nominal.")
@@ -171,6 +176,7 @@ class ArmFile(Strict):
     urdf: str | None = None  # instead of rows of joints: a URDF beside this file
     base: str | None = None  # its links
     tip: str | None = None
+    torques: bool = False
     thermometer: bool = False
     identification: Identification | None = None
     corrections: CorrectionsTable | None = None

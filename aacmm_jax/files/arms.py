@@ -194,8 +194,8 @@ def _specification(path: Path, model: ArmFile, probe: Numbers | None) -> ArmSpec
         arm = _arm_of_rows(model)
         specification = ArmSpecification(arm if probe is None else with_tool(arm, probe))
     arm = specification.arm
-    if model.thermometer:
-        arm = arm.replace(thermometer=True)
+    if model.torques or model.thermometer:
+        arm = arm.replace(torques=model.torques, thermometer=model.thermometer)
     if model.corrections is not None:
         arm = model.corrections.corrected(arm, units)
     prior = None if model.priors is None else model.priors.prior(arm, units)
@@ -305,7 +305,7 @@ def specification_toml(specification: ArmSpecification, *, source: str = "", pro
     document.update({"convention": "standard", "length_unit": "mm", "angle_unit": "rad"})
     geometry = {kind: np.asarray(getattr(arm, kind)).tolist() for kind in GEOMETRY if getattr(arm, kind) is not None}
     document["probe"] = geometry.pop("probe")
-    facts = {"prismatic": list(arm.prismatic), "thermometer": arm.thermometer}
+    facts = {"prismatic": list(arm.prismatic), "torques": arm.torques, "thermometer": arm.thermometer}
     document.update({key: fact for key, fact in facts.items() if fact})
     rows = tomlkit.array().multiline(True)
     for i in range(arm.joints):

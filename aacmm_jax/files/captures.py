@@ -16,6 +16,7 @@ from ..data.observations.declared import Entry
 from ..data.observations.observation import AbstractObservation, kinds
 from ..data.recording import ProbedSphere, Recording, checked_sphere
 from ..kinematics.arm import Arm, correction_names, readings_unit
+from ..kinematics.chain import beside_joints
 from ..kinematics.corrected_arm import loads_of
 from ..kinematics.parameters import ArmSpecification, UrdfSource, single
 from ..kinematics.priors import Prior
@@ -96,6 +97,8 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
         tables["urdf"] = Table(variables, {"base": urdf.base, "tip": urdf.tip})
     if recording.true is not None:
         tables["true_arm"] = arm_table(recording.true)
+    if recording.as_found is not None:
+        tables["as_found_arm"] = arm_table(recording.as_found)
     if recording.spheres:
         tables["sphere"] = sphere_table(recording.spheres, arm)
     if recording.usual is not None:
@@ -125,7 +128,9 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
         tuple(zip(given.get("repeated_starts", ()), given.get("repeated_ends", ()), strict=True)),
     )
     numbers = sorted(int(name.removeprefix(_OBSERVATION)) for name in stored.tables if name.startswith(_OBSERVATION))
-    true = specification_of(path, stored, "true_arm") if "true_arm" in stored.tables else None
+    true, as_found = (
+        specification_of(path, stored, name) if name in stored.tables else None for name in ("true_arm", "as_found_arm")
+    )
     with naming(path):
         capture = Capture(
             {name: q[owner == name] for name in names},
@@ -147,6 +152,7 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
         true,
         spheres=spheres,
         usual=record_in(ArmNoise, USUAL_NOISE, stored.tables.get("usual_noise")),
+        as_found=as_found,
         **values_in(Recording, RECORDING, stored.tables, stored.attributes),
     )
 
@@ -178,17 +184,20 @@ def _observation(path: str | os.PathLike, table: StoredTable) -> AbstractObserva
 
 
 def _reading_variables(name: str, readings: Float[np.ndarray, "N n"], arm: Arm, rows: str = "pose") -> dict:
-    """Readings as variables: those of the joints, and the temperature that may follow them."""
+    """Readings as variables: those of the joints, and the torques and the temperature that may follow them."""
     variables = {name: Variable((rows, "joint"), readings[:, : arm.joints], readings_unit(arm), "joint reading")}
-    if readings.shape[1] > arm.joints:
-        variables["temperature"] = Variable((rows,), readings[:, arm.joints], "degC", "temperature of the arm")
+    torques, temperature = (readings[:, columns] for columns in beside_joints(arm.joints, readings.shape[1]))
+    if torques.size:
+        variables["torque"] = Variable((rows, "joint"), torques, "N m", "torque of the joint's drive")
+    if temperature.size:
+        variables["temperature"] = Variable((rows,), temperature[:, 0], "degC", "temperature of the arm")
     return variables
 
 
 def _readings_of(table: Mapping[str, np.ndarray], name: str) -> Float[np.ndarray, "N n"]:
-    """The readings that `_reading_variables` wrote, with the temperature last where there is one."""
-    temperature = table.get("temperature")
-    return table[name] if temperature is None else np.concatenate([table[name], temperature[:, None]], axis=1)
+    """The readings that `_reading_variables` wrote, with torques and the temperature last where there are such."""
+    beside = [table[column] for column in ("torque", "temperature") if column in table]
+    return np.column_stack([table[name], *beside]) if beside else table[name]
 
 
 def lengths_of(stored: Stored) -> tuple[ReferenceLength, ...]:
@@ -233,6 +242,7 @@ def arm_table(specification: ArmSpecification) -> Table:
     arm, prior = single(specification.arm), specification.prior
     values = dict.fromkeys(ARM) | specification._asdict() | {kind: getattr(arm, kind) for kind in GEOMETRY}
     values |= {"prismatic": arm.prismatic or None, "thermometer": arm.thermometer or None}
+    values["torques"] = arm.torques or None
     if arm.limits is not None:
         values["lowest"], values["highest"] = np.transpose(arm.limits)
     if arm.corrections is not None:
@@ -268,6 +278,7 @@ def specification_of(path: str | os.PathLike, stored: Stored, name: str) -> ArmS
             **{kind: table.get(kind) if kind == "beta" else table[kind] for kind in GEOMETRY},
             limits=limits,
             prismatic=list(attributes.get("prismatic", ())),
+            torques=bool(attributes.get("torques", False)),
             thermometer=bool(attributes.get("thermometer", False)),
         )
         if "coefficients" in table:

@@ -16,6 +16,9 @@ from ..core.text import shorten
 from ..data.capture import Capture, ReferenceLength, check_readings, join_sessions
 from ..data.observations.held import Socket
 from ..data.recording import ProbedSphere, Recording, checked_sphere
+from ..kinematics.arm import Arm
+from ..kinematics.chain import beside_joints
+from ..kinematics.parameters import ArmSpecification
 from ..kinematics.workspace import Reach
 from .arms import arm_beside, for_capture, read_arm, usual_noise
 from .inputs import InputFile
@@ -90,9 +93,11 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
                 "[sessions] applies only to tables with a session, but no table has a session; remove [sessions]."
             )
         capture = _capture(lengths, observed, probe == "remounted")
-        if capture.columns == nominal.arm.joints + 1:
-            nominal = nominal._replace(arm=nominal.arm.replace(thermometer=True))
+        torques, temperature = beside_joints(nominal.arm.joints, capture.columns)
+        beside = {"torques": torques.stop > torques.start, "thermometer": temperature.start < capture.columns}
+        nominal = nominal._replace(arm=nominal.arm.replace(**{key: True for key, given in beside.items() if given}))
         check_readings(capture, nominal.arm)
+        as_found = None if model.as_found is None else _as_found(arm_beside(path.parent, model.as_found), nominal.arm)
         recording = Recording(
             capture,
             for_capture(nominal, proposed, capture),
@@ -102,8 +107,21 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
             acceptance=(model.acceptance,) if isinstance(model.acceptance, str) else tuple(model.acceptance),
             measuring_range=model.measuring_range,
             usual=usual_noise(arm, base=model.base, tip=model.tip),
+            as_found=as_found,
         )
         return recording, readings
+
+
+def _as_found(file: str | Path, nominal: Arm) -> ArmSpecification:
+    """The arm as it arrived, which reads as the nominal one does."""
+    specification = read_arm(file)[0]
+    arm = specification.arm.replace(torques=nominal.torques, thermometer=nominal.thermometer)
+    if (arm.joints, arm.prismatic) != (nominal.joints, nominal.prismatic):
+        raise InputError(
+            f"as_found = '{Path(file).name}' has {arm.joints} joints or other prismatic joints than arm, which has "
+            f"{nominal.joints}; name the file of the same arm with the parameters that it had on arrival."
+        )
+    return specification._replace(arm=arm)
 
 
 def read_points(path: str | os.PathLike) -> Measured:

@@ -13,7 +13,7 @@ from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import check_revolutions
 from ..kinematics.arm import Arm
 from .manifest_tables import Angles, PointsTable, as_list
-from .table_columns import LINE, TEMPERATURE, header_units, position_columns, proposed_columns, reading_columns
+from .table_columns import LINE, TEMPERATURE, TORQUE, header_units, position_columns, proposed_columns, reading_columns
 from .text_lines import Column
 from .text_table import TextTable
 
@@ -45,9 +45,10 @@ def checked_unit(
 
 
 class Readings:
-    """Joint readings of tables, in rad and mm, with the arm's temperature as a last column where there is one.
+    """Joint readings of tables, in rad and mm, with the joints' torques, N m, and the arm's temperature as last columns
+    where there are such.
 
-    Raises `InputError` where columns are missing or not clear, units are missing or differ, or one table has
+    Raises `InputError` where columns are missing or not clear, units are missing or differ, or one table has torques or
     temperatures and another not.
     """
 
@@ -63,7 +64,8 @@ class Readings:
         stated = wanted.columns
         if stated is None and self._angles is not None and self._angles.columns is not None:
             stated = as_list(self._angles.columns)
-        picked = reading_columns(text, self._arm.joints, wanted.taken, stated)
+        of_torques = self._torques(text)
+        picked = reading_columns(text, self._arm.joints, [*wanted.taken, *of_torques], stated)
         thermometer = text.pick([TEMPERATURE]) if text.has([TEMPERATURE]) else []
         if set(thermometer) & set(picked):
             raise InputError(
@@ -73,6 +75,8 @@ class Readings:
         numbers = text.numbers(picked, measured=True, stated=stated is not None)
         angles = self._angles_of(text, picked, wanted)
         q = angles.converted(numbers, self._arm)
+        if of_torques:
+            q = np.concatenate([q, text.numbers(of_torques)], axis=1)
         check_revolutions(str(text.path), q, self._arm, 'correct the header, or write unit = "deg" in [angles]')
         temperature = text.numbers(thermometer)[:, 0] if thermometer else None
         readings = with_temperature(q, temperature, wanted.temperature, str(text.path))
@@ -80,12 +84,29 @@ class Readings:
             self._first, self.columns = (readings.shape[1], text.path), [i + 1 for i in picked]
             self.header, self.angles = list(text.header), angles
         if self._first[0] != readings.shape[1]:
-            (_, without), (_, other) = sorted((self._first, (readings.shape[1], text.path)), key=lambda table: table[0])
-            raise InputError(
-                f"{without} has no temperatures, but {other} has temperatures; add a column {TEMPERATURE} to "
-                f"{without}, or state {TEMPERATURE} in its table."
+            (less, without), (more, other) = sorted(
+                (self._first, (readings.shape[1], text.path)), key=lambda table: table[0]
             )
+            what, column = ("torques", TORQUE.format("1")) if more - less > 1 else ("temperatures", TEMPERATURE)
+            add = f"add columns {column}, ... to {without}."
+            if column == TEMPERATURE:
+                add = f"add a column {TEMPERATURE} to {without}, or state {TEMPERATURE} in its table."
+            raise InputError(f"{without} has no {what}, but {other} has {what}; {add}")
         return readings
+
+    def _torques(self, text: TextTable) -> list[int]:
+        """The columns of the joints' torques: those that the manifest names, or that have the usual names."""
+        joints, stated = self._arm.joints, None if self._angles is None else self._angles.torques
+        names = [TORQUE.format(joint) for joint in range(1, joints + 1)] if stated is None else as_list(stated)
+        if joints == 1 or (stated is None and not text.has(names)):
+            return []
+        picked = text.pick(names)
+        if len(picked) != joints:
+            raise InputError(
+                f"{text.path} has {len(picked)} columns of torques, but the arm has {joints} joints; pick one per "
+                "joint with torques in [angles]."
+            )
+        return picked
 
     def _angles_of(self, text: TextTable, picked: Sequence[int], wanted: Wanted) -> Angles:
         """How these readings are written: what the table states comes first, then [angles], the header, the preset.

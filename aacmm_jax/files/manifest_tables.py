@@ -29,7 +29,7 @@ from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation, kinds
 from ..data.recording import SphereTest
 from ..kinematics.arm import Arm, by_joint
-from ..kinematics.corrections import REFERENCE_TEMPERATURE
+from ..kinematics.correction_kinds import REFERENCE_TEMPERATURE
 from .table_columns import OF_UR
 from .text_lines import Column
 from .toml import Point, Strict, each_once
@@ -117,6 +117,7 @@ class Angles(Strict):
     sign: Literal[1, -1] | list[Literal[1, -1]] = 1
     offset: FiniteFloat | list[FiniteFloat] = 0.0
     columns: Picked | None = None
+    torques: Picked | None = None  # columns of the joints' torques, N m
     linear_unit: Literal["mm", "m", "um", "inch", "counts"] = "mm"  # of prismatic joints
     counts_per_mm: _ByJoint | None = None
 
@@ -300,6 +301,7 @@ class Sessions(Strict):
 
 class _Poses(Recorded):
     arm: str
+    as_found: str | None = None  # the arm with the parameters that its controller had on arrival
     base: str | None = None  # links of a URDF
     tip: str | None = None
     probe: Point | None = None  # mm, from the tip link

@@ -29,6 +29,7 @@ _NO_JOINT = re.compile("[xyzt]|time|timestamp|date|stamp|index|row|point|socket|
 OF_UR = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 _POSITIONS = (("x", "y", "z"), ("px", "py", "pz"))
 TEMPERATURE = "temperature_C"  # the column of the arm's temperature
+TORQUE = "torque_{}_Nm"  # the columns of the joints' torques
 LINE = "columns = [{}]"  # what a manifest states; of commands it is an option
 
 

@@ -50,6 +50,8 @@ class Arm(eqx.Module):
         coefficients: Of the corrections' functions ``(..., k)``; by default 0.
         gravity: Direction of gravity in the base frame ``(..., 3)``, for corrections by its moments; by default down.
         corrections: What joints do besides their readings; `kinematics.with_corrections` makes them.
+        torques: Whether readings have n more columns after those of the joints: the torques of their drives, N m (N of
+            prismatic joints), of which only corrections by torques make use. Not of an arm with a single joint.
         thermometer: Whether readings have one more, last column: the temperature of the arm, C, of which only thermal
             expansion makes use. Where it is missing, the arm is taken to be at 20 C.
 
@@ -72,6 +74,7 @@ class Arm(eqx.Module):
     coefficients: Float[AnyArray, "... k"] | None
     gravity: Float[AnyArray, "... 3"] | None
     corrections: Corrections | None
+    torques: bool = eqx.field(static=True)
     thermometer: bool = eqx.field(static=True)
 
     def __init__(
@@ -88,6 +91,7 @@ class Arm(eqx.Module):
         coefficients: Numbers | None = None,
         gravity: Numbers | None = None,
         corrections: Corrections | None = None,
+        torques: bool = False,
         thermometer: bool = False,
     ):
         sizes: dict[str, int] = {}
@@ -119,6 +123,9 @@ class Arm(eqx.Module):
         numbers = checked(prismatic, Sequence[Annotated[int, Range(1, self.joints)]], "prismatic")
         self.prismatic = tuple(sorted({int(number) for number in numbers}))
         self.limits = None if limits is None else checked_limits(limits, self.joints, self.prismatic)
+        self.torques = bool(torques) or (corrections is not None and corrections.functions.by_torque)
+        if self.torques and self.joints == 1:
+            raise InputError("torques need an arm with at least two joints; create the arm without torques.")
         self.thermometer = bool(thermometer) or (corrections is not None and corrections.functions.expands)
 
     @property
@@ -128,8 +135,14 @@ class Arm(eqx.Module):
 
     @property
     def columns(self) -> int:
-        """Number of columns of readings: the joints, and the thermometer where there is one."""
-        return self.joints + self.thermometer
+        """Number of columns of readings: the joints, their torques and the thermometer where there are such."""
+        return self.joints * (1 + self.torques) + self.thermometer
+
+    @property
+    def possible_columns(self) -> tuple[int, ...]:
+        """Numbers of columns that readings may have: torques and temperatures may be missing."""
+        beside = {0, self.joints * self.torques}
+        return tuple(sorted({self.joints + more + last for more in beside for last in {0, int(self.thermometer)}}))
 
     @property
     def geometry(self) -> Geometry:
@@ -190,8 +203,8 @@ def _evaluated(function: Callable, arm: Arm, q: Numbers) -> Any:
 def checked_readings(arm: Arm, q: Numbers, like: AnyArray | None = None) -> Float[AnyArray, "... n"]:
     """Readings as an array like the arm's or another, or `InputError` where they do not have the arm's columns."""
     array, joints = as_array(q, "q", like=arm.alpha if like is None else like), arm.joints
-    if array.shape[-1:] not in ((joints,), (joints + arm.thermometer,)):
-        other = ", and a thermometer" if arm.thermometer else ""
+    if array.ndim == 0 or array.shape[-1] not in arm.possible_columns:
+        other = ", their torques" * arm.torques + ", and a thermometer" * arm.thermometer
         raise InputError(
             f"q has shape {array.shape}, but the arm has {joints} joints{other}; the last axis must run over the "
             "joints."
@@ -202,10 +215,12 @@ def checked_readings(arm: Arm, q: Numbers, like: AnyArray | None = None) -> Floa
 def check_columns(arm: Arm, columns: int) -> None:
     """Raise `InputError` where readings of a capture have not the columns of an arm; without temperatures it was at
     20 C."""
-    if columns not in (arm.joints, arm.columns):
+    if columns not in arm.possible_columns:
         temperature = ", and the temperature in the last column" if arm.thermometer else ""
         if columns == arm.joints + 1:
             temperature = ", or use an arm with thermometer=True if the last column is the temperature"
+        elif columns >= 2 * arm.joints and not arm.torques:
+            temperature = ", or use an arm with torques=True if columns of torques follow"
         raise InputError(
             f"the capture has {columns} columns, but the arm has {arm.joints} joints; give one column per "
             f"joint{temperature}."

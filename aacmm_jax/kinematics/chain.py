@@ -57,7 +57,7 @@ class JointKinds:
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class KnownFunctions:
-    """The functions of a chain's corrections, static in every program: which there are is in `corrections`.
+    """The functions of a chain's corrections, static in every program: which there are is in `correction_kinds`.
 
     A function of gravity is the product of the direction of gravity g with three rows,
 
@@ -108,6 +108,11 @@ class KnownFunctions:
         """Of each function that is another joint's reading: its number, that joint, and the one it moves, from 0."""
         terms = enumerate(self.terms)
         return tuple((b, term.number - 1, term.joint - 1) for b, term in terms if term.kind.of_other_reading)
+
+    @property
+    def by_torque(self) -> bool:
+        """Whether some function is the torque of a joint."""
+        return any(term.kind.of_torque for term in self.terms)
 
     @property
     def expands(self) -> bool:
@@ -193,8 +198,14 @@ def reading_units(geometry: Geometry) -> Float[np.ndarray, " n"]:
     return np.ones(geometry.alpha.shape[-1]) if geometry.kinds is None else geometry.kinds.units
 
 
+def beside_joints(joints: int, columns: int) -> tuple[slice, slice]:
+    """Which columns of readings, after those of the joints, are their torques, and which one is the temperature."""
+    torques = joints if 1 < joints <= columns - joints else 0
+    return slice(joints, joints + torques), slice(joints + torques, joints + torques + 1)
+
+
 def of_joints(geometry: Geometry, rows: Float[AnyArray, "columns ..."]) -> Float[AnyArray, "n ..."]:
-    """The readings of the joints alone, which come first, without that of a thermometer."""
+    """The readings of the joints alone, which come first, without torques and temperature."""
     joints = geometry.alpha.shape[-1]
     return rows if rows.shape[0] == joints else rows[:joints]
 
@@ -204,7 +215,7 @@ def joint_motion(geometry: Geometry, q: Float[AnyArray, "... n"]) -> JointMotion
 
     Cosines and sines are half of the time of a forward pass. Of the geometry, only what an identification does not
     change matters: the kinds of the joints, and the nominal arm of its corrections. ``q`` is ``(..., n)``, rad, or mm
-    of prismatic joints; ``(..., n + 1)`` with a thermometer, C.
+    of prismatic joints; torques and the temperature follow where they were recorded (`beside_joints`).
     """
     return joint_motion_of_rows(geometry, joints_first(q, max(q.ndim - 1, 1)))
 

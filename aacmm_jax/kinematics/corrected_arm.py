@@ -12,10 +12,12 @@ from ..core.linear_algebra import independent_columns
 from ..core.numpy_or_jax import namespace, to_numpy
 from .arm import DOWN, Arm, correction_names, is_single, joint_limits, without_corrections
 from .chain import Corrections, Geometry, KnownFunctions, forward_pass, joint_motion, joints_first
-from .corrections import Loads, Term, term_of, terms_of
+from .correction_kinds import KILO, Loads, Term, Torque
+from .corrections import term_of, terms_of
 
 _CONFIGURATIONS = 300
 _TEMPERATURES = (10.0, 30.0)  # C
+_TORQUES = (-100.0, 100.0)  # N m
 _INDEPENDENT = 1e-6  # of a function's size: what must be left of it beside the constant and those before it
 
 
@@ -83,6 +85,9 @@ def _determined(arm: Arm, terms: Sequence[Term], gravity: Float[np.ndarray, " 3"
         return ()
     limits = np.concatenate([joint_limits(arm, None), [_TEMPERATURES]])
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_CONFIGURATIONS, arm.joints + 1))
+    if any(term.kind.of_torque for term in terms):
+        torques = np.random.default_rng(1).uniform(*_TORQUES, (_CONFIGURATIONS, arm.joints))
+        q = np.concatenate([q[:, :-1], torques, q[:, -1:]], axis=1)
     values, chosen = function_values(arm.geometry, terms, q, gravity), []
     constant = np.full((_CONFIGURATIONS, 1), _CONFIGURATIONS**-0.5)
     for joint in range(arm.joints + 1):  # 0: functions that scale all lengths
@@ -130,6 +135,21 @@ def with_couplings_of(coupled: Arm, arm: Arm) -> Arm:
     values = {functions.names[i]: coupled.coefficients[i] for i in numbers if np.round(coupled.coefficients[i])}
     missing = [name for name in values if name not in correction_names(arm)]
     return with_further_corrections(arm, missing).replace(**values) if values else arm
+
+
+def holding_torques(arm: Arm, q: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
+    """Torques of the drives that hold an arm of known masses at readings ``(N, n)``, N m.
+
+    `InputError` where the masses are unknown.
+    """
+    loads = None if arm.corrections is None else loads_of(arm)
+    if arm.corrections is None or loads is None:
+        raise InputError(
+            "the torques of poses that were not recorded follow from masses, but the masses are unknown; create the "
+            "arm by with_corrections(arm, 'torque', mass=..., centre=...), or without torques."
+        )
+    terms, down = Torque().terms(arm.joints, "", loads), np.asarray(DOWN)
+    return function_values(arm.corrections.nominal, terms, q, down).T / KILO
 
 
 def loads_of(arm: Arm) -> Loads | None:

@@ -202,7 +202,8 @@ def project_to_targets(
 
     Args:
         arm: The arm.
-        q: Joint readings to begin with ``(N, n)``, rad, or mm of prismatic joints; a thermometer's stay as they are.
+        q: Joint readings to begin with ``(N, n)``, rad, or mm of prismatic joints; torques and temperatures stay as
+            they are.
         targets: Positions of the tip, one each ``(N, 3)``, mm.
         limits: Lowest and highest reading of each joint ``(n, 2)``, rad or mm; by default none.
         steps: Most steps of each configuration.
@@ -303,7 +304,7 @@ def readings_at_poses(
     if not is_single(arm):
         raise InputError("a single arm is needed, but this is a batch; use jax.vmap, or select one arm of the batch.")
     q, n = as_array(q, "q", like=arm.alpha), arm.joints
-    if q.shape[-1:] not in ((n,), (arm.columns,)) or poses.shape != (*q.shape[:-1], 4, 4):
+    if q.shape[-1] not in arm.possible_columns or poses.shape != (*q.shape[:-1], 4, 4):
         raise InputError(
             f"q has shape {q.shape}, poses has shape {poses.shape}, and the arm has {n} joints; give q as (..., n) "
             "and poses as (..., 4, 4), with one pose per configuration."

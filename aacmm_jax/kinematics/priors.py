@@ -13,7 +13,8 @@ from ..core.arrays import Numbers, is_concrete
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
 from .arm import Arm, correction_names, is_length, natural_steps, parameter_names
-from .corrections import KINDS, Harmonics, coefficient_of, unit_of_coefficient
+from .correction_kinds import Harmonics
+from .corrections import KINDS, coefficient_of, unit_of_coefficient
 
 MIXED = "mm and mrad"
 LEAST_STEPS = 1e-4  # smallest learned standard deviation, in natural steps: 0.1 um, 0.02 arcsec

@@ -1,10 +1,10 @@
 """Normal equations in arrow form, and rows from which the private geometry is eliminated.
 
 Let w be whitened rows, A their derivatives by the head x (parameters and shared geometry), and B those by the numbers y
-of a component. The normal equations of 1/2 |w + A dx + B dy|^2 are
+of a component, with a row of A and B for each unknown. The normal equations of 1/2 |w + A^T dx + B^T dy|^2 are
     [A A^T  C^T] [dx]     [A w]
-    [C      D  ] [dy] = - [B w]        with D = B B^T and C = B A^T
-(rows of A and B are unknowns here). For a given head the component is at dy = -D^-1 (B w + C dx). So the rows depend on
+    [C      D  ] [dy] = - [B w]        with D = B B^T and C = B A^T.
+For a given head the component is at dy = -D^-1 (B w + C dx). So the rows depend on
 the head as A~ = A - C^T D^-1 B, the eliminated derivatives, and their information sum A~ A~^T is the Schur complement
 A A^T - C^T D^-1 C of the arrow.
 

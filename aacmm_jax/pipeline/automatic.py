@@ -173,4 +173,6 @@ def with_best_model(record: CalibrationRecord, recorded: Record, options: Any) -
 def _with_functions(model: str, functions: str) -> str:
     """A model with these functions of each joint in place of its own."""
     kinds = [kind for kind in model.split(",") if kind != _PLAIN and not kind.startswith("harmonics")]
-    return ",".join([*kinds[:1], functions, *kinds[1:]] if kinds[:1] == ["gravity"] else [functions, *kinds])
+    return ",".join(
+        [*kinds[:1], functions, *kinds[1:]] if kinds[:1] in (["gravity"], ["torque"]) else [functions, *kinds]
+    )

@@ -22,6 +22,7 @@ from ..kinematics.priors import Prior, default_prior
 from ..model.loss_names import LossName
 from .automatic import with_best_model, with_full_couplings, with_wider_bounds, without_contradicting
 from .cross_validation import can_cross_validate, cross_validate
+from .data_corrections import corrected_capture, with_corrected_readings, with_prior_of_few
 from .hold_out import held_out_poses, tested, without_held_out
 from .single import CalibrationOptions, calibrate, identify
 
@@ -90,9 +91,10 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         monte_carlo: check the uncertainties by Monte Carlo.
         strict: raise `InputError` where such data could not determine free parameters even without noise.
         remove_contradicting: leave out groups that contradict all others.
-        automatic: find joints that move with others, widen default bounds that the fit reaches, leave out what
-            contradicts the rest, and compare models of the joints unless a model, a prior, a method or a robust loss is
-            stated. ``decisions`` of the record says what was done and why.
+        automatic: give too few data the prior and the noise of a real arm, correct readings that do not match the arm
+            where one order, signs, zeros or unit explain them, find joints that move with others, widen default bounds
+            that the fit reaches, leave out what contradicts the rest, and compare models of the joints unless a model,
+            a prior, a method or a robust loss is stated. ``decisions`` of the record says what was done and why.
         max_steps: most evaluations of each solve.
         stage: called with what is done next, in words, and a function that does it, such as to show progress.
 
@@ -124,8 +126,10 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
     elif chosen.model is not None and nominal.prior is None and nominal.arm.corrections is not None:
         nominal = nominal._replace(prior=default_prior(nominal.arm))
     recording = recording._replace(nominal=nominal._replace(arm=nominal.bounds().space.base))
-    automatic = chosen.automatic and chosen.scale == "measured"
-    stated = (chosen.model, chosen.robust, chosen.method, nominal.prior, nominal.arm.corrections)
+    automatic, decided = chosen.automatic and chosen.scale == "measured", ()
+    if automatic:
+        recording, chosen, decided = with_prior_of_few(recording, chosen)
+    stated = (chosen.model, chosen.robust, chosen.method, recording.nominal.prior, nominal.arm.corrections)
 
     def recorded(result: Calibration | Identification, part: Recording) -> CalibrationRecord:
         record = record_of(result, part, robust=chosen.robust)
@@ -136,7 +140,11 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         warnings.simplefilter("ignore", IdentifiabilityWarning)
         solved = partial(_solved, chosen)
         record = chosen.stage("Calibrating", lambda: recorded(solved(recording), recording))
+        record = record._replace(decisions=decided)
         if automatic:
+            check = lambda: with_corrected_readings(record, solved, recorded)  # noqa: E731
+            record, explanation = chosen.stage("Checking readings", check)
+            capture = capture if explanation is None else corrected_capture(capture, explanation) or capture
             further = chosen.model is None and nominal.arm.corrections is None
             record = chosen.stage("Checking couplings", lambda: with_full_couplings(record, solved, recorded, further))
             record = chosen.stage("Checking bounds", lambda: with_wider_bounds(record, solved, recorded))

@@ -32,6 +32,7 @@ from ..data.recording import Recording
 from ..diagnostics.findings import findings_of, sentences
 from ..diagnostics.usability import why_unusable
 from ..kinematics.arm import Arm
+from .data_corrections import with_readings_of_arm
 
 
 class EvaluationOptions(NamedTuple):
@@ -62,7 +63,9 @@ def evaluate_capture(record: CalibrationRecord, recording: Recording, **options:
     """Evaluate a calibration on a capture: what ``aacmm evaluate`` does, with the same defaults.
 
     A socket counts as identified from if the calibration used any of its poses. Of another observation, the poses that
-    it did not use are held out, as far as they determine their geometry: that is fitted to the arm.
+    it did not use are held out, as far as they determine their geometry: that is fitted to the arm. Readings in another
+    order, with other signs or units than those of the calibrated arm are corrected where a single such explanation
+    makes them match; a warning says so.
 
     Args:
         record: the calibration.
@@ -96,7 +99,7 @@ def evaluate_capture(record: CalibrationRecord, recording: Recording, **options:
     """
     chosen = EvaluationOptions(**options)
     used = {row.tobytes() for row in np.asarray(record.recording.capture.readings)}
-    capture = recording.capture.select(chosen.only, chosen.without)
+    capture, corrected = with_readings_of_arm(record, recording.capture.select(chosen.only, chosen.without))
     capture = _divided(record.calibrated.arm, capture, used)
     check_geometry(record.calibrated.arm, capture)
     readings = dict(capture.sockets) | {part.name: part.q for part in capture.observations}
@@ -107,6 +110,7 @@ def evaluate_capture(record: CalibrationRecord, recording: Recording, **options:
         recording._replace(
             capture=capture,
             nominal=record.recording.nominal,
+            as_found=recording.as_found or record.recording.as_found,
             measuring_range=chosen.measuring_range or recording.measuring_range,
         ),
         record.calibrated,
@@ -129,7 +133,7 @@ def evaluate_capture(record: CalibrationRecord, recording: Recording, **options:
         for name, count in shared.items()
         if 0 < count < len(readings[name])
     ]
-    warnings = [*_warnings(record, recording, evaluation, partly), *unstated_uncertainty_warning(tests)]
+    warnings = [*corrected, *_warnings(record, recording, evaluation, partly), *unstated_uncertainty_warning(tests)]
     return evaluation._replace(warnings=tuple(warnings))
 
 
@@ -202,7 +206,10 @@ def _warnings(
             f"The calibration used some of the poses of {', '.join(partly)}; the other poses of these sockets and "
             "observations are treated as used by the calibration, too."
         )
-    if not same_arm(recording.nominal.arm, record.recording.nominal.arm):
+    nominal, given = record.recording.nominal.arm, recording.nominal.arm
+    if record.decisions and given.joints == nominal.joints:  # zeros that the calibration has corrected
+        given = given.replace(theta=nominal.theta)
+    if not same_arm(given, nominal):
         yield (
             f"The capture is of '{recording.nominal.name}', but the calibration is of "
             f"'{record.recording.nominal.name}'; check that the arm is the same."

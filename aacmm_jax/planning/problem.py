@@ -14,7 +14,8 @@ from ..data.noise import CLASSES, ArmNoise, Noise, small_arm_noise
 from ..kinematics.arm import Arm, is_single, jacobian_at, joint_limits
 from ..kinematics.chain import reading_units
 from ..kinematics.collisions import Cell, HalfSpace
-from ..kinematics.corrections import Expansion
+from ..kinematics.corrected_arm import loads_of
+from ..kinematics.correction_kinds import Expansion, Torque
 from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import (
     TOOL_AXIS,
@@ -142,8 +143,10 @@ class DesignProblem(NamedTuple):
             raise InputError("a plan needs a single arm, but this is a batch; select one arm of the batch.")
         options = checked_fields(options)
         space = Parameters.free_of(arm) if options.space is None else options.space
-        # Plans are at 20 C, so they say nothing of thermal expansion.
-        space = to_numpy(Parameters(space.base, tuple(name for name in space.names if name != Expansion.words[0])))
+        # Plans are at 20 C, so they say nothing of thermal expansion, and without masses their torques are unknown.
+        kinds = (Expansion,) if arm.corrections is None or loads_of(arm) else (Expansion, Torque)
+        planned = tuple(name for name in space.names if name.split("_")[0] not in [kind.words[0] for kind in kinds])
+        space = to_numpy(Parameters(space.base, planned))
         if arm.beta is None and space.base.beta is not None:  # free, and 0 so far
             arm = arm.replace(beta=np.zeros(arm.joints))
         length = default_length(arm) if options.check_length is None else options.check_length

@@ -49,8 +49,17 @@ def drift_trend(trend: Trend, axes: Any = None) -> Any:
     """
     if axes is None:
         axes = new_figure((8.2, 6.8)).subplots(2, 1, height_ratios=(1.9, 1))
+    for plot, part in zip(trend_plots(trend), axes, strict=True):
+        draw(plot, part)
+    return axes
+
+
+def trend_plots(trend: Trend) -> tuple[Plot, ...]:
+    """Plots of the changes of the parameters and of lengths; without the lengths of two calibrations if these are not
+    there one by one, as in a comparison that was read from a file."""
     if len(trend.drifts) == 1:
-        plots = _changes_of_two(trend.drifts[0]), _lengths_of_two(trend.drifts[0])
+        (drift,) = trend.drifts
+        plots = (_changes_of_two(drift), *([_lengths_of_two(drift)] if len(drift.lengths.change) else []))
     else:
         seconds = np.array([date.timestamp() for date in trend.dates])
         span, count = seconds[-1] - seconds[0], len(seconds)
@@ -67,9 +76,7 @@ def drift_trend(trend: Trend, axes: Any = None) -> Any:
         # The dates stand below the lower axes alone.
         undated = x._replace(title="", ticks=tuple((at, "") for at, _ in x.ticks))
         plots = _changes_over_time(trend, undated, positions), _lengths_over_time(trend, x, positions)
-    for plot, part in zip(plots, axes, strict=True):
-        draw(plot, part)
-    return axes
+    return plots
 
 
 def _changes_over_time(trend: Trend, x: Axis, positions: np.ndarray) -> Plot:

@@ -11,7 +11,7 @@ from ..core.text import pluralise
 from ..core.units import DEG, people_read
 from ..diagnostics.pose_residuals import observation_residuals
 from ..kinematics.arm import is_length, parameter_unit
-from ..kinematics.corrections import Term
+from ..kinematics.correction_kinds import Term
 from ..pipeline.model_ladder import ComparedModels
 from ..summaries.compared_models import compared_models_summary
 from ..summaries.result_tables import listed_apart

@@ -159,10 +159,12 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
 
 
 def _nominal_and_calibrated(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
-    stages = {"nominal": "nominal", "stage1": "stage 1", "calibrated": "calibrated"}
+    stages = dict(result_tables.STAGES)
     if not record.stage1_apart:
         del stages["stage1"]  # which is the calibrated arm
     introduction = "The nominal and the calibrated arm, compared on the poses used for identification."
+    if record.recording.as_found is not None:
+        introduction += " The arm as found has the parameters that were in its controller on arrival."
     if record.robust:
         introduction += " RMS values count every pose in full, including poses whose weight the robust loss reduced."
     blocks: list[Block] = [introduction]

@@ -141,7 +141,7 @@ def _acceptance(
     ]
     metrics = [metric for test in rows for metric in test["figures"]]
     limited = any(metric["limit_mm"] is not None for metric in metrics)
-    nominal = any(metric["as_found_mm"] is not None for metric in metrics)
+    nominal = any(metric["nominal_mm"] is not None for metric in metrics)
     if limited:
         used = dict.fromkeys(f"{test['rule']} (for {test['standard']})" for test in rows if test["decision"])
         blocks.append(
@@ -189,7 +189,7 @@ def _artefacts(lengths: Sequence[ReferenceLength], spheres: Sequence[ProbedSpher
 def _nominal_and_calibrated(
     record: EvaluationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation]
 ) -> list[Block]:
-    stages = {stage: stage for stage in _STAGES}
+    stages = {stage: words for stage, words in result_tables.STAGES.items() if stage != "stage1"}
     blocks: list[Block] = [
         result_tables.metrics_table(f"{title} [mm]", rows, stages, fixed_scale=rows["fixed_by_one_length"])
         for group, title in _GROUPS

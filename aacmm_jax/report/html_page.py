@@ -18,7 +18,7 @@ from ..plot.svg import drawn, key, points
 from ..summaries.tables import Cell, Table
 from .elements import ArmView, Report
 
-KINDS = ("calibration", "evaluation", "study", "model comparison")
+KINDS = ("calibration", "evaluation", "study", "model comparison", "comparison")
 _FOLDER = Path(__file__).parent
 _MOST_STACKED = 30  # cells: more would be a list without end
 _NARROW, _CHARACTER, _GAP = 370.0, 7.6, 8.0  # pixels: a telephone's page, a character, between columns
@@ -51,13 +51,13 @@ _ADDRESS = ("street", "postal_code", "city", "country", "email", "phone")
 def write_report(
     source: str | os.PathLike, target: str | os.PathLike, administrative_data: AdministrativeData | None = None
 ) -> dict[str, Any]:
-    """Write the report of a calibration, an evaluation, a study or compared models as one HTML file.
+    """Write the report of a calibration, an evaluation, a study, or compared models or calibrations as one HTML file.
 
     Returns title, verdict, warnings and size of the report. `InputError` if the source cannot be read or the target not
     written, the administrative data state a conformity that the source contradicts, or Jinja is not installed.
 
     Args:
-        source: The HDF5 file of the calibration, the evaluation, the study or the compared models.
+        source: The HDF5 file of the calibration, the evaluation, the study, or the compared models or calibrations.
         target: The HTML file to write, whole or not at all.
         administrative_data: Laboratory, customer, item, persons, dates and artefacts, shown in a section of their own.
 
@@ -79,9 +79,9 @@ def write_report(
             mark = "unsure" if report.decision == "conforms" else report.verdict_mark  # no real arm conforms
             report = report._replace(warnings=warnings, verdict_mark=mark)
         if administrative_data is not None:
-            tested = kind == "evaluation"
-            check_conformity(administrative_data, simulated=report.simulated, decision=report.decision, tested=tested)
-            report = report._replace(administrative=_administrative(administrative_data, tested))
+            needed = "" if kind == "evaluation" else "write the report of an evaluation with limits"
+            check_conformity(administrative_data, simulated=report.simulated, decision=report.decision, needed=needed)
+            report = report._replace(administrative=_administrative(administrative_data))
         page = _render(report, _origin(read, attributes))
         write_text(target, page)
     return {
@@ -112,6 +112,11 @@ def _report_of(kind: str, source: str | os.PathLike, attributes: dict[str, Any])
         from .studies import study_report
 
         return study_report(Results.of(source))
+    if kind == "comparison":
+        from ..files.comparisons import load_comparison
+        from .drift import comparison_report
+
+        return comparison_report(load_comparison(source))
     from ..files.evaluations import load_compared_models
     from .studies import models_report
 
@@ -176,8 +181,8 @@ def _stacked(table: Table, cells: list[list[Cell]]) -> bool:
     return characters * _CHARACTER + _GAP * len(texts) > _NARROW
 
 
-def _administrative(given: AdministrativeData, tested: bool) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Groups of titles and values of the administrative data; ``tested``: whether the report has acceptance tests."""
+def _administrative(given: AdministrativeData) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Groups of titles and values of the administrative data."""
 
     def stated(part: str, key: str) -> str:
         value = getattr(getattr(given, part), key)
@@ -206,9 +211,8 @@ def _administrative(given: AdministrativeData, tested: bool) -> list[tuple[str, 
     for title, lines in (("Reference artefacts", artefacts), ("Responsible", persons)):
         groups.append((title, [("", line) for line in lines or [NOT_STATED]]))
     if given.conformity is not None:
-        source = "" if tested else " (stated by the laboratory; this file contains no acceptance test)"
         conformity = given.conformity
-        words = f"{conformity.verdict}: {conformity.specification}; {conformity.decision_rule}{source}"
+        words = f"{conformity.verdict}: {conformity.specification}; {conformity.decision_rule}"
         groups.append(("Statement of conformity", [("", words)]))
     return groups
 

@@ -49,11 +49,14 @@ def study_report(results: Results) -> Report:
         title=f"Study {summary['name']}".strip() + f" of {summary['arm'] or 'an arm'}",
         subtitle=f"{summary['cells']} cell{'' if summary['cells'] == 1 else 's'} of {summary['trials']:,} simulated "
         "calibrations",
-        verdict=f"{'Finished' if summary['finished'] else 'Not finished'}: {ran:,} trials run, "
-        f"{100 * fraction:.4g} % converged",
+        verdict=summary["finding"] or f"No trial has converged ({ran:,} trials run).",
         verdict_mark="bad" if ran and not converged else mark,
         warnings=warnings,
-        facts=[("Factors", "; ".join(factors) or "none varied"), ("Seed", str(summary["seed"]))],
+        facts=[
+            ("Trials run", f"{ran:,} ({100 * fraction:.4g} % converged)"),
+            ("Factors", "; ".join(factors) or "none varied"),
+            ("Seed", str(summary["seed"])),
+        ],
         sections=[
             Section("cells", "Cells", [cell_table(summary)]),
             *sections,

@@ -18,6 +18,7 @@ from ..kinematics.arm import parameter_unit
 from ..solver.reason import Reason, numbers_of
 from .blocks import DIMENSIONS, METRICS, VARIABLES
 from .definition import POOL_PARTS
+from .finding import finding
 from .store import Results, factor_columns
 
 if TYPE_CHECKING:
@@ -90,7 +91,8 @@ def study_summary(results: Results, only: int | None = None) -> dict[str, Any]:
         only: Only this cell, counted from 1; all if None.
 
     Returns:
-        The study's name, arm, seed, size and factors, and under "results" the `cell_summary` of each cell.
+        The study's name, arm, seed, size and factors, under "results" the `cell_summary` of each cell, and under
+        "finding" how far each factor changes the errors, in a sentence.
 
     Example:
         >>> summary = aj.study.study_summary(results)
@@ -99,7 +101,7 @@ def study_summary(results: Results, only: int | None = None) -> dict[str, Any]:
     """
     study = results.study
     cells = [cell_summary(results, cell) for cell in range(len(study.cells)) if only is None or cell == only - 1]
-    return {
+    summary = {
         "kind": "study",
         "name": study.specification.name,
         "arm": study.nominal.name,
@@ -111,6 +113,7 @@ def study_summary(results: Results, only: int | None = None) -> dict[str, Any]:
         "factors": study.factors,
         "results": cells,
     }
+    return summary | {"finding": finding(summary)}
 
 
 def cell_summary(results: Results, cell: int) -> dict[str, Any]:

@@ -143,7 +143,9 @@ def parameter_table(summary: Mapping[str, Any]) -> Table:
 
 
 def study_view(summary: dict[str, Any]) -> View:
-    """What people see of a study, or of one cell with every parameter."""
+    """What people see of a study, or of one cell with every parameter: its finding first."""
+    if summary["finding"]:
+        yield Styled(summary["finding"])
     yield [
         Styled(summary["name"] or "Study"),
         f" of {summary['arm']}: {summary['cells']} cells of {summary['trials']:,} trials, seed {summary['seed']}",

@@ -25,6 +25,7 @@ from ..diagnostics.pose_residuals import rms
 from ..diagnostics.recorded import findings_of_capture
 from ..diagnostics.usability import on_bounds
 from ..kinematics.arm import Arm, by_joint, correction_names, parameter_unit, value_of
+from ..kinematics.chain import beside_joints
 from ..kinematics.corrected_arm import loads_of
 from ..kinematics.corrections import coefficient_of
 from ..kinematics.parameters import ArmSpecification
@@ -88,7 +89,8 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
     """A capture: sockets with their poses, lengths, the nominal arm."""
     capture, units = recording.capture, by_joint(recording.nominal.arm, "rad", "mm")
     q = np.asarray(capture.readings)
-    warmth, ends = q[:, len(units) :], zip(units, q.min(axis=0).tolist(), q.max(axis=0).tolist(), strict=False)
+    torques, warmth = (q[:, columns] for columns in beside_joints(len(units), q.shape[1]))
+    ends = zip(units, q.min(axis=0).tolist(), q.max(axis=0).tolist(), strict=False)
     return {
         "kind": "capture",
         "arm": recording.nominal.name,
@@ -101,6 +103,7 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
             {"joint": i, f"lowest_{unit}": low, f"highest_{unit}": high}
             for i, (unit, low, high) in enumerate(ends, start=1)
         ],
+        "largest_torques_Nm": np.abs(torques).max(axis=0).tolist() if torques.size else None,
         "temperature_C": [float(warmth.min()), float(warmth.max())] if warmth.size else None,
         "simulated": recording.true is not None,
         "warnings": sentences(findings_of_capture(recording)),
@@ -110,7 +113,7 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
 def masses_sentence(arm: Arm) -> str | None:
     """Which masses the bending of an arm's joints was computed with; None where masses are not taken as known."""
     loads = None if arm.corrections is None else loads_of(arm)
-    if loads is None:
+    if arm.corrections is None or loads is None or not np.any(arm.corrections.functions.by_gravity):
         return None
     links = ", ".join(f"{mass:.3g}" for mass in loads.mass)
     return (
@@ -284,7 +287,7 @@ def shared_rows(shared: SharedErrors) -> list[dict[str, Any]]:
 
 def cross_validation_summary(validation: CrossValidation) -> dict[str, Any]:
     """All groups together, and every group, the most improbable first; mm."""
-    chances = [min(filter(math.isfinite, group.probabilities), default=math.nan) for group in validation.groups]
+    chances = [min(filter(math.isfinite, chances), default=math.nan) for chances in validation.probabilities]
     rows = []
     for i, (label, group, chance) in enumerate(zip(validation.labels, validation.groups, chances, strict=True)):
         error, u = (rms(values) for values in (group.length_error, group.length_u))

@@ -20,13 +20,17 @@ def drift_summary(drift: Drift) -> dict[str, Any]:
     probe = joint.probe
     return {
         "kind": "comparison",
-        **attributes(drift, "level", "warnings", "compared", moved_by_chance="by_chance"),
+        **attributes(drift, "answer", "level", "warnings", "compared", moved_by_chance="by_chance"),
         "findings": drift.findings(),
         "parameters": _rows(drift),
         "moved": int(drift.moved.sum()),
         "joint": {
             **attributes(joint, "statistic", "rank", "p", freedom="degrees_of_freedom", parameters="names"),
             "causes": [{"parameter": name, "unit": units[name], "change": amount} for name, amount in joint.causes],
+            "detectable": [
+                {"parameter": name, "unit": units[name], "change": plain(size)}
+                for name, size in zip(joint.names, joint.detectable, strict=True)
+            ],
             # Of the hypothesis that only the probe changed.
             "probe": probe
             and attributes(probe, "remounted", "rank", "p", "ratio", statistic_left="statistic")
@@ -104,11 +108,20 @@ def drift_csv(trend: Trend, labels: list[str]) -> str:
 
 
 def comparison(summary: dict[str, Any]) -> View:
-    """Findings in sentences, then the numbers: the last against the first; of three or more, all against the first."""
+    """The answer, findings in sentences, then the numbers: the last against the first; of three or more, all against
+    the first."""
+    yield Styled(summary["answer"])
     new, old = (f"{summary[which]} ({summary[f'{which}_created'][:10]})" for which in ("new", "old"))
-    yield [Styled(summary["arm"]), f": {new} compared with {old}"]
+    yield f"{summary['arm']}: {new} compared with {old}"
     yield from tables.warnings_of(summary)
     yield from summary["findings"]
+    yield from comparison_tables(summary)
+    yield from tables.limits_of(summary)
+    yield from tables.written_of(summary)
+
+
+def comparison_tables(summary: dict[str, Any]) -> View:
+    """Parameters and lengths of the last calibration less those of the first; of three or more, all of them."""
     yield from _parameters(summary)
     lengths = summary["lengths"]
     keys = ("rms_mm", "rms_by_chance_mm", "percentile_95_mm", "largest_mm", "mean_mm")
@@ -139,8 +152,6 @@ def comparison(summary: dict[str, Any]) -> View:
         title = "Each calibration minus the first (the error of the first calibration is contained in every row)"
         yield listed(title, rows, (*headings, "mean [um/m]"))
         yield "For the change of every parameter from the first calibration, use --csv, --json or --figure."
-    yield from tables.limits_of(summary)
-    yield from tables.written_of(summary)
 
 
 def _parameters(summary: dict[str, Any]) -> View:

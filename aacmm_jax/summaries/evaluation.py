@@ -1,10 +1,11 @@
 """Evaluations and acceptance tests as plain dictionaries with the unit in every key; ``--json`` prints them."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ..acceptance.judgement import RULES
+from ..acceptance.judgement import RULES, Rule, deciding_uncertainty
 from ..acceptance.record import EvaluationRecord, PointsRecord, check_geometry, unstated_uncertainty_warning
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
 from ..calibration.agreement import NOTHING, Agreement
@@ -20,10 +21,11 @@ from ..diagnostics.pose_residuals import rms
 from ..pipeline.cross_validation import groups_of
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .calibration import agreement_row, length_metrics, metrics, metrics_by_socket_and_length
+from .maxima import judged_maxima
+from .result_tables import BEFORE
 from .tables import attributes, plain, rows_of
 from .verdicts import evaluation_verdict
 
-_LIMITED = {"rms_mm": "RMS distance", "deltam_mm": "Deltam", "length_error_largest_mm": "largest length error"}
 _EXPANSION = {
     "coefficient_per_k": "coefficient",
     "u_coefficient_per_k": "u_coefficient",
@@ -36,7 +38,8 @@ _GROUPS = {"held_out": "held-out data", "identified_from": "the data used for id
 def evaluation_summary(
     record: EvaluationRecord, tests: dict[str, list[AcceptanceTest]] | None = None
 ) -> dict[str, Any]:
-    """The nominal and the calibrated arm on a capture, on held-out data and on those identified from; acceptance tests.
+    """The nominal and the calibrated arm, and the arm as found where that is known, on a capture, on held-out data and
+    on those identified from; acceptance tests.
 
     A length counts as held out if at least one of its ends was not identified from. Errors on held-out data stand
     beside those that the uncertainty of the calibration predicts. ``tests`` (`EvaluationRecord.acceptance`) are run if
@@ -68,9 +71,11 @@ def evaluation_summary(
         }
         if not wanted:
             summary["warnings"] += _add_prediction(summary[group], record, part, lengths)
-    summary["kept"], summary["failed"] = _exceeded(summary, record)
+    decisions = judged_maxima(summary, record)
+    for key, decision in (("kept", "conforms"), ("failed", "fails"), ("undecided", "undecided")):
+        summary[key] = [judged.says for judged in decisions if judged.decision == decision]
     tests = record.acceptance() if tests is None else tests
-    summary |= _judged(record, tests["calibrated"], tests["nominal"])
+    summary |= _judged(record, tests)
     summary["verdict"] = evaluation_verdict(summary, len(summary["warnings"]))._asdict()
     return summary | {"calibration_warnings": list(record.calibration_warnings)}
 
@@ -159,14 +164,16 @@ def _add_prediction(
         if any(abs(row["error_over_expanded"] or 0.0) > 1 for row in group["lengths"]):
             unexpected = of_lengths
     group["predicted"] = {
-        "poses": agreement_row(poses),
+        "poses": agreement_row(poses) | {"degrees_of_freedom": plain(poses.degrees_of_freedom)},
         "lengths": {
             "lengths": of_lengths.count,
             "normalised_error_rms": plain(of_lengths.rms / of_lengths.predicted),
             "probability": plain(of_lengths.probability),
         },
     }
-    before, after = (group[stage].get("observed_rms_mm", group[stage].get("rms_mm")) for stage in record.arms())
+    before, after = (
+        group[stage].get("observed_rms_mm", group[stage].get("rms_mm")) for stage in ("nominal", "calibrated")
+    )
     unseen = surprise(poses, unexpected, by_name, lambda: _with_probe_fitted(record.uncertainty, part))
     return sentences(unseen + no_better(before, after))
 
@@ -185,25 +192,6 @@ def _with_probe_fitted(uncertainty: Uncertainty | None, part: Capture | None) ->
     return errors.of(errors.parts)
 
 
-def _exceeded(summary: dict[str, Any], record: EvaluationRecord) -> tuple[list[str], list[str]]:
-    """Sentences on limits kept and limits exceeded by the calibrated arm, on held-out data if there are any."""
-    kept, failed = [], []
-    for name, limit in record.maxima.items():
-        for group, where in _GROUPS.items():
-            values = (summary[group] or {}).get("calibrated", {})
-            # Of a capture with observations besides sockets, the RMS distance is that of all poses.
-            key = "observed_rms_mm" if name == "rms_mm" and "observed_rms_mm" in values else name
-            if key in values:
-                relation, verdicts = ("within", kept) if values[key] <= limit else ("over", failed)
-                verdicts.append(
-                    f"{_LIMITED[name]} on {where} is {values[key]:.4f} mm, {relation} the limit of {limit:g} mm."
-                )
-                break
-        else:
-            failed.append(f"{_LIMITED[name]} has a limit of {limit:g} mm, but cannot be determined from these data.")
-    return kept, failed
-
-
 def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = None) -> dict[str, Any]:
     """Acceptance tests of points; ``tests`` (`PointsRecord.acceptance`) are run if not given."""
     tests = record.acceptance() if tests is None else tests
@@ -218,17 +206,22 @@ def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = No
         "warnings": unstated_uncertainty_warning(tests),
         "kept": [],
         "failed": [],
-        **_judged(record, tests),
+        "undecided": [],
+        **_judged(record, {"calibrated": tests}),
     }
     return summary | {"verdict": evaluation_verdict(summary, len(summary["warnings"]))._asdict()}
 
 
 def _judged(
-    record: EvaluationRecord | PointsRecord, tests: list[AcceptanceTest], before: list[AcceptanceTest] | None = None
+    record: EvaluationRecord | PointsRecord, by_stage: Mapping[str, Sequence[AcceptanceTest]]
 ) -> dict[str, Any]:
-    """Acceptance tests, and what adds uncertainty to their values; ``before``: those of the nominal arm, whose metrics
-    are added."""
-    earlier = {(test.title, metric.name): metric for test in before or () for metric in test.metrics}
+    """Acceptance tests, and what adds uncertainty to their values: those of the calibrated arm, to whose metrics those
+    of the nominal arm and of the arm as found are added."""
+    tests = by_stage["calibrated"]
+    earlier = {
+        stage: {(test.title, metric.name): metric for test in by_stage.get(stage, ()) for metric in test.metrics}
+        for stage in BEFORE
+    }
     influences = record.influences
     bodies = {"artefact": influences.artefact, "arm": influences.arm}
     expansions = {
@@ -240,7 +233,8 @@ def _judged(
             | {
                 "rule": RULES[test.rule],
                 "figures": [
-                    _metric(metric, earlier.get((test.title, metric.name))) | {"symbol": test.symbol(metric)}
+                    _metric(metric, {stage: of.get((test.title, metric.name)) for stage, of in earlier.items()})
+                    | {"symbol": test.symbol(metric), "deciding_mm": _deciding(metric, test.rule)}
                     for metric in test.metrics
                 ],
             }
@@ -251,7 +245,15 @@ def _judged(
     }
 
 
-def _metric(metric: Metric, earlier: Metric | None) -> dict[str, Any]:
+def _deciding(metric: Metric, rule: Rule) -> float | None:
+    """The expanded uncertainty with which an undecided metric would be decided, mm."""
+    worst = metric.worst
+    if worst.decision != "undecided" or worst.limit is None:
+        return None
+    return deciding_uncertainty(worst.value, worst.limit, rule)
+
+
+def _metric(metric: Metric, earlier: Mapping[str, Metric | None]) -> dict[str, Any]:
     def part(value: MetricValue) -> dict[str, Any]:
         return attributes(value, "where", value_mm="value", expanded_mm="expanded", limit_mm="limit")
 
@@ -259,8 +261,8 @@ def _metric(metric: Metric, earlier: Metric | None) -> dict[str, Any]:
         **attributes(metric, "name", "decision"),
         "what": METRICS[metric.name],
         **part(metric.worst),
-        "as_found_mm": None if earlier is None else earlier.value,
-        "as_found_decision": None if earlier is None else earlier.decision,
+        **{f"{stage}_mm": None if before is None else before.value for stage, before in earlier.items()},
+        **{f"{stage}_decision": None if before is None else before.decision for stage, before in earlier.items()},
         "failing": sum(value.decision == "fails" for value in metric.values),
         "parts": [part(value) | {"decision": value.decision} for value in metric.values],
     }

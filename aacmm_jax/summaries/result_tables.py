@@ -12,7 +12,10 @@ from .tables import METRICS, Cell, Columns, Table, decimals_for, listed, number
 
 Row = Mapping[str, Any]
 Rows = Sequence[Row]
-STAGES = {"nominal": "nominal", "stage1": "stage 1", "calibrated": "calibrated"}
+# Arms by the keys of a summary. The arm as found, with the parameters that its controller had on arrival, is there only
+# where these are known.
+STAGES = {"nominal": "nominal", "as_found": "as found", "stage1": "stage 1", "calibrated": "calibrated"}
+BEFORE = {stage: STAGES[stage] for stage in ("nominal", "as_found")}
 BY_CONSTRUCTION = "fixed the scale"  # so that its error is zero
 MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}  # of decisions
 _SIGNS = {"conforms": "✓ conforms", "fails": "✗ fails", "undecided": "? undecided", None: "–"}
@@ -37,10 +40,11 @@ def _two_decimals(key: str) -> Any:
 def metrics_table(
     caption: str, summary: Row, stages: Mapping[str, str] = STAGES, *, fixed_scale: bool = False
 ) -> Table:
-    """Repeatability and length errors, one column per arm.
+    """Repeatability and length errors, one column per arm that the summary has.
 
     ``fixed_scale``: a single length fixed the scale of the last arm, so its error is zero by construction.
     """
+    stages = {stage: words for stage, words in stages.items() if stage in summary}
     first, *_, last = stages
 
     def value(stage: str, key: str) -> Cell | str:
@@ -54,6 +58,7 @@ def metrics_table(
 
 def truth_table(truth: Row, stages: Mapping[str, str] = STAGES) -> Table:
     """Errors of parameters against the true arm of a simulation."""
+    stages = {stage: words for stage, words in stages.items() if stage in truth}
     rows = [
         ["largest error of a length parameter [mm]", *(truth[stage]["length_error_largest_mm"] for stage in stages)],
         ["largest error of an angle parameter [deg]",
@@ -289,20 +294,21 @@ def stated_expanded(u: float) -> Cell:
 def acceptance_tables(tests: Rows, *, brief: bool = False) -> list[Table]:
     """The metrics of each acceptance test, with their limits and decisions where there are any.
 
-    ``brief``: without the decisions of the nominal arm, and without what each metric is.
+    ``brief``: without the decisions of the nominal arm and of the arm as found, and without what each metric is.
     """
     metrics = [metric for test in tests for metric in test["figures"]]
     limited = any(metric["limit_mm"] is not None for metric in metrics)
-    nominal = any(metric["as_found_mm"] is not None for metric in metrics)
-    value = "calibrated" if nominal else "value"
+    earlier = [stage for stage in BEFORE if any(metric.get(f"{stage}_mm") is not None for metric in metrics)]
+    value = "calibrated" if earlier else "value"
 
     def decided(row: Row) -> Cell:
         parts = len(row["parts"])
         count = f" ({row['failing']} of {parts})" if row["failing"] and parts > 1 else ""
         return Cell(_SIGNS[row["decision"]] + count, None, MARKS[row["decision"]])
 
-    def before(row: Row) -> Cell:
-        return Cell(_SIGNS[row["as_found_decision"]], None, MARKS[row["as_found_decision"]])
+    def decided_before(stage: str) -> Any:
+        key = f"{stage}_decision"
+        return lambda row: Cell(_SIGNS[row[key]], None, MARKS[row[key]])
 
     def read(key: str) -> Any:
         return lambda row: number(row[key], decimals_for(row["expanded_mm"]))
@@ -310,12 +316,12 @@ def acceptance_tables(tests: Rows, *, brief: bool = False) -> list[Table]:
     # Decisions first: on a telephone, what stands behind them is off the screen.
     columns: Columns = {
         "metric": "symbol",
-        f"decision, {value}" if nominal and not brief else "decision": decided if limited else None,
-        "decision, nominal": before if limited and nominal and not brief else None,
+        f"decision, {value}" if earlier and not brief else "decision": decided if limited else None,
+        **{f"decision, {BEFORE[stage]}": decided_before(stage) for stage in earlier if limited and not brief},
         value: read("value_mm"),
         f"U ({K_IN_WORDS})": lambda row: stated_expanded(row["expanded_mm"]),
         "MPE": "limit_mm" if limited else None,
-        "nominal": read("as_found_mm") if nominal else None,
+        **{BEFORE[stage]: read(f"{stage}_mm") for stage in earlier},
         "worst at": "where",
         "meaning": None if brief else "what",
     }

@@ -178,9 +178,9 @@ def verdict_of(summary: Mapping[str, Any]) -> list[Line]:
 
 
 def limits_of(summary: Mapping[str, Any]) -> list[Line]:
-    """Limits that are kept, and limits that are exceeded."""
-    kept = [[Styled("Passed:", "green"), f" {sentence}"] for sentence in summary["kept"]]
-    return [*kept, *([Styled("Failed:", "red"), f" {sentence}"] for sentence in summary["failed"])]
+    """Limits that are kept, those that are exceeded, and those that the data do not decide on."""
+    words = {"kept": ("Passed:", "green"), "failed": ("Failed:", "red"), "undecided": ("Undecided:", "yellow")}
+    return [[Styled(*words[key]), f" {sentence}"] for key in words for sentence in summary.get(key, ())]
 
 
 def written_of(summary: Mapping[str, Any]) -> list[Line]:

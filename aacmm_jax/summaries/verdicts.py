@@ -11,6 +11,7 @@ from ..calibration.agreement import SIGNIFICANCE
 from ..core.text import shorten
 from ..diagnostics.findings import Finding
 from ..uncertainty.coverage import U_AT_LEVEL
+from .result_tables import BEFORE
 from .tables import two_digits
 
 _LACKING = "the residuals show errors that the model does not describe"  # what tests of residuals doubt
@@ -97,7 +98,7 @@ def overall_decision(summary: Mapping[str, Any]) -> str | None:
     decisions = [metric["decision"] for test in summary["acceptance"] for metric in test["figures"]]
     if summary["failed"] or "fails" in decisions:
         return "fails"
-    if "undecided" in decisions:
+    if summary.get("undecided") or "undecided" in decisions:
         return "undecided"
     return "conforms" if "conforms" in decisions or summary["kept"] else None
 
@@ -117,22 +118,34 @@ def evaluation_verdict(summary: Mapping[str, Any], own_warnings: int = 0) -> Ver
     if unusable := summary.get("calibration_unusable"):
         return Verdict("bad", f"Not usable, because the calibration is not: {unusable}.", False)
     if decision == "undecided":
-        says = f"Undecided: the measurement is too uncertain for a decision on {shorten(names)}."
-        return Verdict("unsure", says, False)
+        sentences = [_undecided(metric) for metric in metrics if metric["decision"] == decision]
+        return Verdict("unsure", f"Undecided: {' '.join([*sentences, *summary.get('undecided', ())][:3])}", False)
     if decision == "conforms":
         incomplete = any(test["missing"] for test in summary["acceptance"] if test["decision"])
         without = dict.fromkeys(metric["name"] for metric in metrics if metric["decision"] is None)
-        before = {metric["name"]: metric["as_found_decision"] for metric in metrics}
-        says = f"Conforms{' (calibrated arm)' if any(before.values()) else ''}: all limits given are met"
+        before = {stage: {row["name"]: row.get(f"{stage}_decision") for row in metrics} for stage in BEFORE}
+        says = f"Conforms{' (calibrated arm)' if any(before['nominal'].values()) else ''}: all limits given are met"
         says += f" ({shorten(list(dict.fromkeys(names)))})" if names else ""
-        failed = [name for name, decision in before.items() if decision == "fails"]
-        says += f"; the nominal arm fails ({shorten(failed)})" if failed else ""
+        for stage, words in (("nominal", "the nominal arm"), ("as_found", "the arm as found")):
+            failed = [name for name, decision in before[stage].items() if decision == "fails"]
+            says += f"; {words} fails ({shorten(failed)})" if failed else ""
         says += f"; no limit was given for {shorten(list(without))}" if without else ""
         says += "; the procedure of a test was not complete." if incomplete else "."
         return Verdict("unsure" if incomplete or own_warnings else "good", says)
     if summary.get("held_out") is None:
         return Verdict("neutral", "Measured; no limit was given.")
     return _as_predicted(summary["held_out"])
+
+
+def _undecided(metric: Mapping[str, Any]) -> str:
+    """What would decide on a metric of an acceptance test: a smaller uncertainty of the test itself."""
+    name, needed = metric["name"], metric.get("deciding_mm")
+    if not needed:
+        return f"the measurement is too uncertain for a decision on {name}."
+    return (
+        f"the measurement is too uncertain for a decision on {name}: its U at {metric['where']} would have to be at "
+        f"most {two_digits(needed)} mm instead of {two_digits(metric['expanded_mm'])} mm (artefact, seat, temperature)."
+    )
 
 
 def _as_predicted(held_out: Mapping[str, Any]) -> Verdict:

@@ -15,6 +15,7 @@ from ..kinematics.arm import Arm, checked_readings
 from ..kinematics.chain import joint_motion
 from ..kinematics.corrected_arm import with_further_corrections
 from ..kinematics.parameters import Parameters
+from .between_groups import BetweenGroups
 from .covariance import SharedErrors
 from .coverage import LEVEL
 from .degrees_of_freedom import Components, Law, coverage_factor, degrees_of_freedom
@@ -52,6 +53,8 @@ class Uncertainty(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     scatter_degrees_of_freedom: float = eqx.field(static=True)  # of the noise; infinite where it was given
     lengths: int = eqx.field(static=True, default=0, kw_only=True)  # from which k was found
+    # How poses of groups that were held out agree with their prediction; None: no groups were.
+    between: BetweenGroups | None = eqx.field(static=True, default=None, kw_only=True)
 
     @property
     def space(self) -> Parameters:

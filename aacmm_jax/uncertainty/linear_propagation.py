@@ -1,9 +1,10 @@
 """How the unknowns follow the rows, and their covariance by the law of propagation (JCGM 100).
 
 Rows are whitened residuals w = R e of the errors e: of the readings and of the seat, which reach them through the arm,
-and of what was measured. With A the eliminated derivatives by the head (parameters and shared geometry), B those by the
-private geometry of a component, W the weights of a robust loss, G the inverse information of the head, D^-1 that of a
-component, and C what couples both (`model.elimination`), the unknowns answer to errors of the rows as
+and of what was measured. With A the eliminated derivatives by the head (A~ of `model.elimination`: parameters and
+shared geometry), B those by the private geometry of a component, W the weights of a robust loss, G the inverse
+information of the head, D^-1 that of a component, and C what couples both (`model.elimination`), the unknowns answer to
+errors of the rows as
 
     dx = -G A W w,    dy = -D^-1 (B W w + C dx),
 

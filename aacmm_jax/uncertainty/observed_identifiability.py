@@ -23,7 +23,7 @@ from ..data.observations.held import position_of
 from ..kinematics.arm import Arm
 from ..kinematics.chain import reading_units
 from ..kinematics.corrected_arm import function_values
-from ..kinematics.corrections import GearRatio, Gravity, Term
+from ..kinematics.correction_kinds import GearRatio, Gravity, Term
 from ..kinematics.parameters import Parameters
 from ..model.elimination import followed, pseudo_inverse, sums_by_component
 from ..model.observed import Observed, ends_of

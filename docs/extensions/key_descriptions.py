@@ -32,6 +32,7 @@ DESCRIPTIONS = {
     "group": "Column that divides the table into several sockets, observations or repeats, and names them.",
     "visits": "Each file is one visit to the socket.",
     "sessions": "How the sessions differ.",
+    "as_found": "The arm with the parameters that its controller had on arrival: a file as for `arm`.",
     "arm": "A shipped name, an arm file (TOML), a URDF, or a `kinematics.yaml`.",
     "tip": "For a URDF: the link at the end.",
     "base": "For a URDF: the link that does not move.",
@@ -54,6 +55,8 @@ DESCRIPTIONS = {
     "theta": "Zero offset.",
     "beta": "Hayati's angle.",
     "limits": "Lowest and highest reading.",
+    "torques": "In an arm file, whether readings have the torque of each joint beside them; in a manifest, the columns "
+    "of these torques, N m.",
     "thermometer": "Whether readings have the arm's temperature as a last column.",
     "identification": "Free and fixed parameters, and the bounds of the free parameters.",
     "held": "Names of the fixed parameters.",

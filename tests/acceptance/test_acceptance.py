@@ -636,7 +636,7 @@ def test_what_makes_an_evaluation_doubtful_is_said_first(calibrated):
     assert "No uncertainty was stated for Deltam" in words
     assert all(test.missing for test in seen.acceptance()["calibrated"])
     failed = aj.evaluate_capture(record._replace(converged=False, reason="It did not."), recording)
-    assert "The calibration failed" in failed.warnings[0]
+    assert "The calibration is not usable" in failed.warnings[0]
     simulated = aj.evaluate_capture(record, recording._replace(true=recording.nominal))
     assert "simulated" in simulated.warnings[0]
 

@@ -123,7 +123,7 @@ def test_not_converged_is_exit_code_1_and_still_written(aacmm, tmp_path, monkeyp
         ),
         (("simulate", "panda", "-o", "x.h5", "--socket", "A=400,0,300", "--seed", 2**63), "Invalid value for '--seed'"),
         (("demo", "/dev/null/x"), "/dev/null/x cannot be used as a folder"),
-        (("calibrate", "capture.h5"), "Missing option"),
+        (("simulate", "panda", "--socket", "A=400,0,300"), "Missing option"),
         (("frobnicate",), "No such command"),
     ],
 )

@@ -102,9 +102,9 @@ NAMES = ("Volumetric performance, 2 RMS", "Volumetric performance, largest", "E_
 def test_acceptance_at_80_columns(monkeypatch, capsys):
     """Every result by its whole name, with every number."""
     monkeypatch.setenv("COLUMNS", "80")
-    numbers = {"value_mm": 0.0312, "as_found_mm": 12.3456, "expanded_mm": 0.0021, "limit_mm": 0.0415}
+    numbers = {"value_mm": 0.0312, "nominal_mm": 12.3456, "expanded_mm": 0.0021, "limit_mm": 0.0415}
     parts = {"failing": 2, "parts": [None] * 7, "decision": "undecided", "where": "500 mm bar at position 3, repeat 2"}
-    parts |= {"as_found_decision": "fails", "what": "error"}
+    parts |= {"nominal_decision": "fails", "what": "error"}
     test = TEST | {"missing": ["5 lengths"], "figures": [{"symbol": name} | numbers | parts for name in NAMES]}
     display(views.points(POINTS | {"acceptance": [test]}))
     shown = capsys.readouterr().out
@@ -123,7 +123,7 @@ def test_a_decision_rule_is_named_only_where_there_is_a_limit(monkeypatch, capsy
         "symbol": "E_Uni",
         "what": "error",
         "value_mm": 0.03,
-        "as_found_mm": None,
+        "nominal_mm": None,
         "expanded_mm": 0.002,
         "limit_mm": limit,
     }

@@ -127,3 +127,11 @@ def test_file_summary_and_warning(paper_arm, captured, tmp_path):
     (said,) = (text for text in summary["warnings"] if text.startswith("Readings of joint 3"))
     assert "times as much as given" in said
     assert not any("Residuals are larger where" in text for text in summary["warnings"])  # it is explained
+
+
+def test_an_encoder_whose_noise_poses_do_not_determine_keeps_that_of_the_others(mukca):
+    """One placement, whose poses hardly see one joint: its noise would be above ten degrees."""
+    recording = aj.files.read_manifest(mukca / "panda_3_bis.toml")
+    bounds, capture = recording.nominal.bounds(), recording.capture.select("front/*")
+    result = aj.calibrate(bounds.space.base, capture, bounds, undetermined="ignore")
+    assert result.noisy_encoders == ()

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from aacmm_jax.data.observations.observation import kinds
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "docs" / "extensions"))
 import command_pages
 import file_pages
@@ -39,3 +41,8 @@ def test_contents_of_hdf5_files_are_listed():
     page = file_pages.hdf5_page()
     for array in ("capture/angle", "calibrated_arm/alpha", "parameters/parameter"):
         assert f"| `{array}` |" in page
+
+
+def test_the_guide_to_manifests_names_every_kind_of_observation():
+    guide = (Path(__file__).resolve().parents[2] / "docs/how_to/manifests.md").read_text()
+    assert [kind.table for kind in kinds().values() if f"`[[{kind.table}]]`" not in guide] == []

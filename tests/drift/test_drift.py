@@ -25,6 +25,7 @@ from aacmm_jax.kinematics.parameters import ArmSpecification
 from aacmm_jax.model.scale import divided_arm
 from aacmm_jax.plot import drift as drift_figure
 from aacmm_jax.summaries.drift import drift_csv, drift_summary
+from tests.conftest import command_line
 from tests.refusals import assert_refused
 
 SOCKETS = {"A": (400, 200, 300), "B": (700, 500, 500)}
@@ -497,10 +498,8 @@ def test_command(run, files, calibrated):
     printed = run("a.h5", "c.h5")
     assert printed.exit_code == 0, printed.exception
     words = " ".join(printed.stdout.split())
-    assert words.startswith(
-        "Cheng 2018, simulated arm: c.h5 (2026-03-01) compared with a.h5 (2026-01-01) Tested together, the "
-        "changes of 21"
-    )
+    assert words.startswith("The arm has changed: zero of joint 4 by ")
+    assert "Cheng 2018, simulated arm: c.h5 (2026-03-01) compared with a.h5 (2026-01-01) Tested together, the" in words
     assert "Warning" not in words
     assert "* beyond U" in words
     summary = json.loads(
@@ -585,6 +584,51 @@ def test_command_refuses(run, files):
 def test_command_in_a_process_of_its_own(aacmm_process, files):
     refused = aacmm_process("compare", "a.h5", "b.h5", "--length-mm", 100000, expect=2)
     assert refused.stderr.startswith("Error: a length of 100000 mm does not fit")
+
+
+def test_a_comparison_is_kept_shown_and_reported(run, files):
+    """The file holds what was printed, and the report begins with the answer."""
+    for names in (("a.h5", "b.h5"), ("a.h5", "b.h5", "c.h5")):
+        printed = run(*names, "-o", "changes.h5").stdout
+        shown = command_line(files, "show", "changes.h5").stdout
+        assert printed.startswith(shown.rstrip())
+        summary = json.loads(run(*names, "--json").stdout)
+        assert aj.files.load_comparison(files / "changes.h5") == summary
+        report = json.loads(command_line(files, "report", "changes.h5", "-o", "changes.html", "--json").stdout)
+        assert report["verdict"] == summary["answer"]
+        assert summary["answer"].split(";")[0] in (files / "changes.html").read_text()
+
+
+@pytest.mark.parametrize("noise", [math.inf, 80.0])
+def test_a_change_that_is_called_detectable_is_found_in_95_of_100_cases(old, noise):
+    """A change by that size has the noncentrality with which the test has this power."""
+    first = certain(old, 0.01, noise)
+    same = compare(first, first, points=20)
+    assert "No change of the arm is seen. A change would have been seen in 95 of 100 cases if one zero" in same.answer
+    size = dict(zip(same.joint_test.names, same.joint_test.detectable, strict=True))["theta_4"]
+    test = compare(first, shifted(first, {"theta_4": size}), points=20).joint_test
+    rank, freedom = test.rank, test.degrees_of_freedom
+    limit = stats.chi2(rank).isf(0.05) if math.isinf(freedom) else stats.f(rank, freedom).isf(0.05)
+    power = (
+        stats.ncx2(rank, test.statistic).sf(limit)
+        if math.isinf(freedom)
+        else stats.ncf(rank, freedom, test.statistic).sf(limit)
+    )
+    assert power == pytest.approx(0.95, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "begins"),
+    [
+        ({}, "No change of the arm is seen"),
+        ({"probe_z": 0.3}, "The probe was remounted ("),
+        ({"theta_4": 1.2e-4}, "The arm has changed: zero of joint 4 by +"),
+        ({"a_2": 0.3}, "The arm has changed: a_2 by +"),
+    ],
+)
+def test_the_answer_comes_first(old, new, changes, begins):
+    drift = compare(old, shifted(new, changes), points=20)
+    assert drift.answer.startswith(begins)
 
 
 REMOUNTED = {"probe_z": 0.3}  # the only coordinate of the probe that is free here

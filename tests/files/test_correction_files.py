@@ -41,10 +41,11 @@ def test_files_bring_the_same_arm_back(masses, tmp_path):
     assert same(arm, aj.files.load_capture(tmp_path / "capture.h5").nominal.arm)
 
 
-def test_an_arm_with_a_thermometer_comes_back(tmp_path):
-    """Readings in every table, with their temperatures; and the arm that they are of, with and without expansion."""
-    plain = SCARA.replace(thermometer=True)
-    q = np.random.default_rng(0).uniform(-1, 1, (12, 5)) + np.array([0, 0, 0, 0, 21.5])
+@pytest.mark.parametrize("torques", [False, True])
+def test_an_arm_with_a_thermometer_comes_back(torques, tmp_path):
+    """Readings in every table, with what was recorded beside them; and the arm, with and without expansion."""
+    plain = SCARA.replace(torques=torques, thermometer=True)
+    q = np.random.default_rng(0).uniform(-1, 1, (12, plain.columns)) + 21.5 * (np.arange(plain.columns) > 3)
     points = aj.data.observations.MeasuredPoints("T", q[4:8], q[4:8, :3], u=0.01)
     ball = aj.data.ProbedSphere("ball", "probing", (q[8:],), 25.0)
     for arm in (plain, with_corrections(plain, "expansion,gear").replace(expansion=12e-6)):
@@ -59,6 +60,7 @@ def test_an_arm_with_a_thermometer_comes_back(tmp_path):
     with h5py.File(tmp_path / "capture.h5") as file:
         assert file["capture/angle"].shape == (4, 4)
         assert dict(file["capture/temperature"].attrs)["units"] == "degC"
+        assert ("torque" in file["capture"]) == torques
 
 
 def plain_toml():
@@ -78,7 +80,7 @@ def test_a_model_in_an_arm_file(tmp_path):
         'model = "gears"': "unknown model 'gears'; did you mean 'gear'",
         "coefficients = {gear_4 = 1e-3}": "'gear_4' must name a joint from 1 to 3",
         'model = "gravity=masses"\nmass = [1, 2, 3]': "give both or neither",
-        'model = "gravity"\nmass = [1, 2, 3]': "apply only to model = 'gravity=masses'",
+        'model = "gravity"\nmass = [1, 2, 3]': "apply only to the models gravity=masses and torque",
         "coefficients = {gear_1 = 1e-3}\nnominal = {alfa = [1, 2, 3]}": "nominal has the unknown key 'alfa'",
     }.items():
         file.write_text(f"{plain}\n[corrections]\n{text}\n")

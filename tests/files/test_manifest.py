@@ -72,6 +72,32 @@ def test_temperatures(tmp_path, motion):
             read(tmp_path, text)
 
 
+def test_torques(tmp_path, motion):
+    """Columns with their usual names, or those that the manifest names; before a temperature, wherever they are."""
+    loads = 10 * motion
+    usual = ",".join(f"torque_{i}_Nm" for i in range(1, 7))
+    table = np.column_stack([motion[:, :3], [21.0, 22.0, 23.0, 24.0], loads, motion[:, 3:]])
+    record(tmp_path / "a.csv", table, header=f"q1,q2,q3,temperature_C,{usual},q4,q5,q6\n")
+    socket = '[[socket]]\nfile = "a.csv"\n'
+    (tmp_path / "capture.toml").write_text(HEAD + ANGLES + socket)
+    recording = aj.files.read_manifest(tmp_path / "capture.toml")
+    expected = np.column_stack([motion, loads, table[:, 3]])
+    np.testing.assert_array_equal(recording.capture.sockets["a"], expected)
+    assert (recording.nominal.arm.torques, recording.nominal.arm.thermometer) == (True, True)
+    record(tmp_path / "b.csv", np.column_stack([motion, loads]), header="q1,q2,q3,q4,q5,q6,l1,l2,l3,l4,l5,l6\n")
+    chosen = read(tmp_path, HEAD + ANGLES + 'torques = "l*"\n' + socket.replace("a.csv", "b.csv"))
+    np.testing.assert_array_equal(chosen.sockets["b"], expected[:, :12])
+    record(tmp_path / "c.csv", motion)
+    both = HEAD + ANGLES + socket + socket.replace("a.csv", "c.csv")
+    few = HEAD + ANGLES + 'torques = ["l1", "l2"]\n' + socket.replace("a.csv", "b.csv")
+    for text, sentence in (
+        (both, "c.csv has no torques, but .*a.csv has torques; add columns torque_1_Nm"),
+        (few, "b.csv has 2 columns of torques, but the arm has 6 joints"),
+    ):
+        with pytest.raises(aj.InputError, match=sentence):
+            read(tmp_path, text)
+
+
 def test_visits_of_sessions_and_targets(tmp_path, motion):
     """Each file is a visit, in sessions too; of a socket with another tip than the probe they are refused."""
     record(tmp_path / "b.csv", motion + 0.1)

@@ -15,7 +15,7 @@ from aacmm_jax.kinematics.corrected_arm import function_values
 from aacmm_jax.kinematics.corrections import terms_of
 from aacmm_jax.kinematics.jacobian import reading_columns, rotation_columns
 
-MODEL = "gravity,harmonics,gear,coupled"
+MODEL = "gravity,harmonics,gear,coupled,torque"
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +159,7 @@ def test_functions_of_the_readings():
 @pytest.mark.parametrize("factor", [-1.0, 1.0])
 def test_a_full_coupling_moves_the_frames_of_gravity_and_the_reading(elbow, factor):
     """Joint 3 of parallel links: its moments are those at the angle that it has, and moving joint 2 moves both."""
-    plain = elbow.replace(corrections=None, coefficients=None, gravity=None)
+    plain = elbow.replace(corrections=None, coefficients=None, gravity=None, torques=False)
     names = ["coupled2_3", "compliance3_2", "compliance3_3"]
     coupled = with_corrections(plain, names).replace(coupled2_3=factor + 1e-3)
     q = readings(plain)

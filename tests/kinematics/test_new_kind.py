@@ -15,7 +15,7 @@ from aacmm_jax.files.arm_tables import prior_of_text, with_model
 from aacmm_jax.kinematics import corrections as kinds
 from aacmm_jax.kinematics import default_prior, with_corrections
 from aacmm_jax.kinematics.arm import correction_names
-from aacmm_jax.kinematics.corrections import AbstractCorrection, Sought
+from aacmm_jax.kinematics.correction_kinds import AbstractCorrection, Sought
 from aacmm_jax.report import write_report
 from aacmm_jax.summaries.calibration import arm_summary
 

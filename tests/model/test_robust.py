@@ -65,6 +65,8 @@ def test_cost_weight_and_transformed_residual(name):
     np.testing.assert_allclose(np.sum(loss.transformed(white) ** 2, axis=0), 2 * cost, rtol=1e-8)
     by_transformed = jax.jit(jax.grad(lambda x: 0.5 * (loss.transformed(x) ** 2).sum()))(white)
     np.testing.assert_allclose(by_transformed, gradient, rtol=1e-6, atol=1e-12)
+    for of_zero in (lambda x: loss.cost_and_weight(x)[0].sum(), lambda x: loss.transformed(x).sum()):
+        assert np.all(np.isfinite(jax.grad(of_zero)(np.zeros((3, 2)))))  # a root of 0 has no derivative
     assert np.all(np.diff(weight[np.argsort(np.sum(white**2, axis=0))]) <= 1e-12)
 
 

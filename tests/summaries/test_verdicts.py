@@ -73,10 +73,9 @@ def test_of_a_simulation_and_of_what_is_not_determined():
     )
 
 
-def evaluated(*decisions, missing=(), found=None, **more):
-    figures = [
-        {"name": f"E_{i}", "decision": decision, "as_found_decision": found} for i, decision in enumerate(decisions)
-    ]
+def evaluated(*decisions, missing=(), found=None, deciding_mm=None, expanded_mm=0.0, where="", **more):
+    row = {"nominal_decision": found, "deciding_mm": deciding_mm, "expanded_mm": expanded_mm, "where": where}
+    figures = [{"name": f"E_{i}", "decision": decision} | row for i, decision in enumerate(decisions)]
     test = {"decision": decisions[0] if decisions else None, "missing": list(missing), "figures": figures}
     return {"acceptance": [test], "failed": [], "kept": [], "held_out": None} | more
 
@@ -101,6 +100,15 @@ _EXPECTED = "Errors on held-out data are about as predicted, or smaller"
     [
         (evaluated("conforms"), "good", "Conforms", 0),
         (evaluated("undecided"), "unsure", "Undecided", 1),
+        (evaluated("conforms", undecided=["About 9 poses."]), "unsure", "Undecided: About 9 poses.", 1),
+        (
+            evaluated("undecided", deciding_mm=0.0123, expanded_mm=0.03, where="bar 1"),
+            "unsure",
+            "Undecided: the measurement is too uncertain for a decision on E_0: its U at bar 1 would have to be at "
+            "most 0.012 mm instead of 0.030 mm",
+            1,
+        ),
+        (evaluated("fails", undecided=["About 9 poses."]), "bad", "Fails", 1),
         (evaluated("fails"), "bad", "Fails", 1),
         (evaluated("fails", calibration_unusable="x"), "bad", "Fails", 1),
         # Whatever the errors are, a calibration that is not usable does not hold.

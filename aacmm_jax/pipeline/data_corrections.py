@@ -1,0 +1,183 @@
+"""What `calibrate_capture` and `evaluate_capture` correct in data that nobody stated otherwise: a prior and noise for
+data that are too few, and readings that are not those of the arm as they are."""
+
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from ..calibration.evaluation import evaluate
+from ..calibration.record import CalibrationRecord
+from ..core.errors import InputError
+from ..core.numpy_or_jax import to_numpy
+from ..core.text import listed
+from ..core.units import DEG, length_unit
+from ..data.capture import Capture
+from ..data.noise import CLASSES, ArmNoise, class_noise
+from ..data.observations.measured import MeasuredPoints
+from ..data.observations.observation import AbstractObservation
+from ..data.recording import Recording
+from ..diagnostics.capture_check import check_capture
+from ..diagnostics.reading_check import explanation_words
+from ..diagnostics.reading_fit import Explanation
+from ..diagnostics.usability import many_on_bounds
+from ..kinematics.arm import Arm
+from ..kinematics.priors import default_prior
+from ..model.observed import Observed
+from .automatic import Record, Solve
+
+# More equations than unknowns with which the residuals show the noise: with fewer, the factor by which Student's t
+# widens every U exceeds 2.8, and a fit without a prior follows the noise.
+_SPARE = 5
+_ROBOT = "robot"
+
+
+def with_prior_of_few(recording: Recording, options: Any) -> tuple[Recording, Any, tuple[str, ...]]:
+    """The recording and the options of `calibrate_capture` for data that are too few to determine all free parameters
+    and the noise: with the prior of a real arm, and the noise that is usual for it; and what was decided, in words.
+
+    In simulated captures of 5 to 10 points, the error of the calibrated arm elsewhere is 0.7 to 0.06 of the nominal
+    arm's; without a prior these captures cannot be calibrated, or follow the noise. The noise of an arm whose class is
+    not known is taken as a robot's, which is the larger one.
+    """
+    nominal, capture = recording.nominal, recording.capture
+    observed, parameters = Observed.of(*to_numpy((capture, nominal.arm))), len(nominal.space().names)
+    unknowns = parameters + len(observed.steps)
+    if observed.equations >= unknowns + _SPARE or options.method is not None or options.robust is not None:
+        return recording, options, ()
+    if nominal.prior is not None and options.noise is not None:
+        return recording, options, ()
+    parts, usual = [], recording.usual
+    if nominal.prior is None:
+        nominal = nominal._replace(prior=default_prior(nominal.arm))
+        parts.append("the parameters have the prior of a real arm (1 mm and 1 mrad, adjusted to the data)")
+    if options.noise is None:
+        usual = usual or ArmNoise(_ROBOT, class_noise(nominal.arm, _ROBOT), CLASSES[_ROBOT].source)
+        options = options._replace(noise=usual.noise)
+        parts.append(f"the readings the noise of a {usual.arm_class} ({usual.source})")
+    says = (
+        f"There are {observed.equations} equations for {unknowns} unknowns ({parameters} parameters), so "
+        f"{' and '.join(parts)}. Record more poses, or state a prior (--prior) and the noise (--encoder-arcsec, "
+        "--seating-mm)."
+    )
+    return recording._replace(nominal=nominal), options, (says,)
+
+
+def with_corrected_readings(
+    record: CalibrationRecord, solve: Solve, recorded: Record
+) -> tuple[CalibrationRecord, Explanation | None]:
+    """The calibration with other orders, signs, zeros or units of the readings, where the data do not match the arm as
+    they are, a single such explanation makes them match, and nothing else is as good; and the explanation.
+
+    The zeros become those of the nominal arm, so that the calibrated arm holds them. Where several explanations are
+    as good, a sentence lists them and nothing is changed.
+    """
+    if not (record.implausible_residual or many_on_bounds(record) or not record.converged):
+        return record, None
+    recording = record.recording
+    try:
+        check = check_capture(recording.nominal.arm, recording.capture)
+    except InputError:  # neither sockets nor points, or too few
+        return record, None
+    best = check.best
+    if not check.explained or check.fits:
+        return record, None
+    if check.others:
+        texts = [explanation_words(other) or "nothing" for other in (best, *check.others[:2])]
+        says = f"The readings do not match the arm, and several corrections fit as well: {'; or '.join(texts)}."
+        return record._replace(decisions=(*record.decisions, f"{says} State the right one in [angles].")), None
+    capture = corrected_capture(recording.capture, best)
+    if capture is None:
+        return record, None
+    nominal = recording.nominal._replace(arm=_with_zeros(recording.nominal.arm, best))
+    corrected = recording._replace(capture=capture, nominal=nominal)
+    try:
+        again = recorded(solve(corrected), corrected)
+    except InputError:
+        return record, None
+    if again.implausible_residual or not again.converged:
+        return record, None
+    says = (
+        f"The readings were corrected: {explanation_words(best)}. The residuals fell from {record.observed.rms:.3g} to "
+        f"{again.observed.rms:.3g} mm RMS. To state this in the manifest: {_line(best)}."
+    )
+    return again._replace(decisions=(*record.decisions, says)), best
+
+
+def with_readings_of_arm(record: CalibrationRecord, capture: Capture) -> tuple[Capture, tuple[str, ...]]:
+    """A capture to evaluate a calibration on, with the order, signs and units of its readings with which they match the
+    calibrated arm, where they do not as they are and a single explanation makes them match; and what was found.
+
+    Zeros are not corrected: another zero than at the calibration is an error of the arm.
+    """
+    observed = evaluate(record.calibrated.arm, capture, noise=record.noise).observed
+    assert observed is not None
+    poses = [*capture.sizes, *(observation.q.shape[0] for observation in capture.observations)]
+    rms = float(np.sqrt(np.average(np.asarray(observed.rms) ** 2, weights=poses)))
+    if rms <= record.largest_plausible_residual:
+        return capture, ()
+    try:
+        # By the nominal arm, for which explanations that are the same by its symmetry are one.
+        check = check_capture(record.recording.nominal.arm, capture)
+    except InputError:  # neither sockets nor points, or too few
+        return capture, ()
+    best, corrected = check.best, corrected_capture(capture, check.best)
+    if not check.explained or check.fits or check.others or corrected is None:
+        return capture, ()
+    if any(best.offsets):
+        return capture, (f"The readings do not match the calibrated arm, unless {explanation_words(best)}.",)
+    says = f"The readings were corrected to match the calibrated arm: {explanation_words(best)}."
+    return corrected, (f"{says} To state this in the manifest: {_line(best)}.",)
+
+
+def corrected_capture(capture: Capture, explanation: Explanation) -> Capture | None:
+    """The capture with the order, signs and units of an explanation, without its zeros; None where a unit of lengths is
+    wrong and there are other lengths than measured points, which may be in another unit."""
+    factor = explanation.length
+    others = [part for part in capture.observations if not isinstance(part, MeasuredPoints)]
+    if factor != 1 and (others or capture.sizes):
+        return None
+
+    def readings(q: Any) -> np.ndarray:
+        values, n = np.array(q), len(explanation.order)
+        values[:, :n] = explanation.hypothesis._replace(offsets=(0.0,) * n).readings(values[:, :n])
+        return values
+
+    def changed(part: AbstractObservation) -> AbstractObservation:
+        if factor == 1:
+            return part.changed(q=readings(part.q))
+        assert isinstance(part, MeasuredPoints)
+        points, covariance = factor * np.asarray(part.points), factor**2 * np.asarray(part.covariance)
+        return part.changed(q=readings(part.q), points=points, covariance=covariance)
+
+    parts = tuple(changed(part) for part in capture.observations)
+    return eqx.tree_at(lambda c: (c.q, c.observations), capture, (readings(capture.q), parts))
+
+
+def _with_zeros(arm: Arm, explanation: Explanation) -> Arm:
+    """The arm whose zeros are where an explanation has them, with joint limits of the readings that it is given."""
+    offsets = np.asarray(explanation.offsets)
+    limits = arm.limits
+    if limits is not None:
+        limits = (np.asarray(limits) - offsets[:, None]).tolist()
+    return arm.replace(theta=np.asarray(arm.theta) + offsets, limits=limits)
+
+
+def _line(explanation: Explanation) -> str:
+    """What a manifest states in ``[angles]`` so that it reads the columns so, if it states nothing of these yet."""
+    order, signs, offsets, angle, length = explanation[:5]
+    unit = "" if angle == 1 else ("deg" if angle < 1 else "rad")
+    parts = [f'unit = "{unit}"'] * bool(unit)
+    if order != tuple(sorted(order)):
+        parts.append(f"columns in the order {listed([str(column + 1) for column in order])}")
+    if min(signs) < 0:
+        parts.append(f"sign = {list(signs)}")
+    if any(offsets):
+        # A reading c becomes sign (c - offset).
+        zeros = [round(-sign * offset / DEG, 4) + 0.0 for sign, offset in zip(signs, offsets, strict=True)]
+        parts.append(f"offset = {zeros} (deg)")
+    lines = [f"[angles] {', '.join(parts)}"] if parts else []
+    if length != 1:
+        points = length_unit(length)
+        lines.append(f"measured points times {length:g}" if points is None else f'units = {{ points = "{points}" }}')
+    return " and ".join(lines)
