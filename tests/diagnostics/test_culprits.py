@@ -88,7 +88,7 @@ def test_a_sound_capture_has_no_cause(paper_arm, capture):
     nominal = ArmSpecification(paper_arm, "test")
     record = aj.calibrate_capture(aj.Recording(capture, nominal), automatic=False, cross_validate=False)
     assert culprits_of(case_of(record)) == ()
-    assert findings_of(record) == []
+    assert [finding for finding in findings_of(record) if finding.severity != "note"] == []
 
 
 @pytest.mark.parametrize("method", ["two-stage", "joint"])
