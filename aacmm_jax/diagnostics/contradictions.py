@@ -26,6 +26,7 @@ _LEAST_RATIO = 9.0
 _LEAST_DIFFERENCE, _LEAST_REMOUNTED = 16.0, 50.0
 _LEVEL = 0.01
 _EXPLAINS = 0.67  # share of a contradiction that a single cause must explain to be named
+_AMID = 2  # poses of a group before and after a change, by which it lies within the group and not at its border
 _LARGE = ("session", "station")  # kinds of groups with more poses than parameters
 _NAMED_ALIKE = ("socket", "observation")  # kinds whose groups are chosen by their own names
 
@@ -169,8 +170,8 @@ def contradictions_of(record: CalibrationRecord) -> list[Contradiction]:
 
 
 def _contradictions(case: Case) -> list[Contradiction]:
-    if any(c.term is not None and c.term.term.first >= 0 and c.explains > _EXPLAINS for c in culprits_of(case)):
-        return []  # something changed at some pose, and groups before and after it differ
+    if changed_within_a_group(case):
+        return []
     equations, kinds = without_bad_poses(case), groupings(case.record.recording.capture)
     best: list[list[GroupTest]] = []
     kind, labels = "", {}
@@ -187,6 +188,17 @@ def _contradictions(case: Case) -> list[Contradiction]:
     contradictions = [Contradiction(kind, tuple(_suspect(equations, labels, test) for test in group)) for group in best]
     negligible = contradictions and contradictions[0].suspects[0].rms_others[0] < EXACT
     return [] if negligible else contradictions
+
+
+def changed_within_a_group(case: Case) -> bool:
+    """Whether something changed at a pose amid a group, which explains why groups before and after it differ."""
+    firsts = [
+        culprit.term.term.first
+        for culprit in culprits_of(case)
+        if culprit.term is not None and culprit.term.term.first >= 0 and culprit.explains > _EXPLAINS
+    ]
+    amid = [part.poses[_AMID:-_AMID] for part in case.equations.rows]
+    return any(first in poses for first in firsts for poses in amid)
 
 
 def without_bad_poses(case: Case) -> Equations:
