@@ -114,9 +114,9 @@ def capture(summary: dict[str, Any]) -> View:
 
 
 def calibration(summary: dict[str, Any]) -> View:
-    """One calibration: warnings first."""
-    yield solve(summary)
+    """One calibration: what it is good for first, then warnings."""
     yield from words.verdict_of(summary)
+    yield solve(summary)
     if summary.get("lengths_tested"):
         yield words.lengths_sentence(summary["lengths_tested"])
     yield from (f"Decided by default: {decision}" for decision in summary["decisions"])
@@ -251,6 +251,11 @@ def _uncertainty(summary: dict[str, Any]) -> View:
 
 def demo(summary: dict[str, Any]) -> View:
     """The demonstration: nominal arm, stage 1 and calibrated arm against the truth."""
+    before, after = (summary[stage]["check_rms_mm"] for stage in ("nominal", "calibrated"))
+    yield Styled(
+        f"Calibrated: lengths of {summary['check_length_mm']:g} mm are measured with an error of {after:.2g} mm RMS, "
+        f"where the nominal arm has {before:.2g} mm."
+    )
     yield (
         "Simulated arm of Cheng et al. 2018: its parameters differ from the nominal ones by up to "
         f"{summary['deviation_mm']:g} mm and {summary['deviation_deg']:g} deg; the noise is "
@@ -300,8 +305,8 @@ def lengths(rows: Sequence[Mapping[str, Any]], *, fixed_scale: bool = False, pre
 
 def evaluation(summary: dict[str, Any]) -> View:
     """One evaluation: decisions first, then held-out data, since they are what counts."""
-    yield Styled(summary["arm"])
     yield from words.verdict_of(summary)
+    yield Styled(summary["arm"])
     yield from words.warnings_of(summary)
     yield from words.limits_of(summary)
     if summary["acceptance"] or summary["standards"]:
@@ -360,10 +365,10 @@ def report(summary: dict[str, Any]) -> View:
 
 
 def points(summary: dict[str, Any]) -> View:
-    """Acceptance tests of points."""
+    """Acceptance tests of points: the decision first."""
     counts = (pluralise(summary[f"{noun}s"], noun) for noun in ("socket", "length", "sphere"))
-    yield f"{pluralise(summary['points'], 'point')}: {', '.join(counts)}"
     yield from words.verdict_of(summary)
+    yield f"{pluralise(summary['points'], 'point')}: {', '.join(counts)}"
     yield from words.warnings_of(summary)
     yield from _acceptance(summary)
     yield from words.written_of(summary)

@@ -176,12 +176,26 @@ def checked_fit(fit: ReadingFit) -> ReadingCheck:
     explained, best, others, equal = closest.rms_fitted <= EXPLAINED * fit.size, closest, (), 0
     if explained:
         best = min(explanations, key=lambda x: (x.outside > 0, x.changes, x.rms_fitted))
+        best = _with_common_zero(fit, best)
         others, equal = _others(fit, best, good)
     best = best if best == given else fit.within_limits(best)
     with_tip = fit.with_tip_found(best) if evidence.own_frame else None
     return ReadingCheck(
         given, best, others, equal, explained, len(evidence.q), evidence.in_base, tried, with_tip, fit.free_tip
     )
+
+
+def _with_common_zero(fit: ReadingFit, best: Explanation) -> Explanation:
+    """The same with one zero for all joints, such as the middle of servos, where several have it, and that fits as well
+    with no more readings outside the joint limits: a single mistake. The data do not show the zeros of all joints, such
+    as that of the first one in an instrument's own frame."""
+    moved = [offset for offset in best.offsets if offset]
+    apart = [abs(math.remainder(offset - moved[0], 2 * math.pi)) for offset in moved]
+    if len(moved) < 2 or max(apart) > _SAME or fit.arm.prismatic:
+        return best
+    common = fit.explanation(best.hypothesis._replace(offsets=(moved[0],) * fit.arm.joints))
+    as_good = common.rms_fitted <= fit.as_good_as(best.rms_fitted) and common.outside <= best.outside
+    return common if as_good else best
 
 
 def _units(fit: ReadingFit) -> Iterator[tuple[float, float]]:
@@ -380,10 +394,12 @@ def explanation_words(explanation: Explanation, positions: str = "mm") -> str:
         words.append(
             f"column{'s' * (len(wrong) > 1)} {listed(wrong)} {'has' if len(wrong) == 1 else 'have'} the opposite sign"
         )
-    for joint, zero in enumerate(offsets, start=1):
-        offset = math.remainder(zero, 2 * math.pi)
-        if abs(offset) > _QUARTERS:
-            value = abs(offset) if abs(abs(offset) - math.pi) < _QUARTERS else offset
+    zeros = [math.remainder(zero, 2 * math.pi) for zero in offsets]
+    values = [abs(zero) if abs(abs(zero) - math.pi) < _QUARTERS else zero for zero in zeros]
+    if len(values) > 1 and min(map(abs, values)) > _QUARTERS and max(values) - min(values) < _QUARTERS:
+        return "; ".join([*words, f"the zeros of all joints are {values[0] / DEG:.4g} deg off"])
+    for joint, value in enumerate(values, start=1):
+        if abs(value) > _QUARTERS:
             words.append(f"the zero of joint {joint} is {value / DEG:.4g} deg off")
     return "; ".join(words)
 

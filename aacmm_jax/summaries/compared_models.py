@@ -114,14 +114,14 @@ def model_tables(summary: Mapping[str, Any]) -> tuple[Table, Table]:
 
 
 def compared_models(summary: dict[str, Any]) -> View:
-    """Compared models."""
+    """Compared models: the recommended one first."""
+    yield from (Styled(finding) for finding in summary["findings"])
     yield [
         Styled(summary["arm"]),
         f": {len(summary['models'])} models on {summary['poses']} poses, {len(summary['regions'])} regions held out "
         "in turn",
     ]
     yield from warnings_of(summary)
-    yield from summary["findings"]
     by_name, by_region = model_tables(summary)
     yield by_name
     yield MODELS_MEANING

@@ -94,6 +94,8 @@ def correction_summary(
 
 def corrections(summary: dict[str, Any]) -> View:
     """How far poses are reached with corrected readings, and how much readings change."""
+    rows, missed = summary["rows"], summary["not_reached"]
+    yield f"{rows - len(missed)} of {pluralise(rows, 'pose')} are reached with corrected readings."
     yield from warnings_of(summary)
     meant, has = (", ".join(f"{x:.3f}" for x in probe) for probe in summary["probe_mm"])
     if meant == has:
@@ -103,8 +105,6 @@ def corrections(summary: dict[str, Any]) -> View:
             f"Position of the tip in the last frame: ({meant}) mm in the controller, ({has}) mm on the calibrated "
             "arm. These positions apply to the probe of the calibration; for another tool, give --probe X,Y,Z."
         )
-    rows, missed = summary["rows"], summary["not_reached"]
-    yield f"{rows - len(missed)} of {pluralise(rows, 'pose')} are reached with corrected readings."
     if len(missed) < rows:
         # Of the arithmetic, not of the arm: how far it is really off is what an evaluation with unseen data says.
         distance = formatted(summary["largest_distance_mm"])

@@ -17,7 +17,7 @@ from ..planning.motion import Motion
 from ..planning.problem import MORE, Prediction
 from ..uncertainty.coverage import COVERAGE_FACTOR, K_IN_WORDS
 from .calibration import reference_length_rows
-from .tables import Styled, View, attributes, listed, number, warnings_of, written_of
+from .tables import Styled, View, attributes, listed, number, two_digits, warnings_of, written_of
 
 _PREDICTED = {
     "predicted": "this plan",
@@ -132,6 +132,7 @@ def procedure_summary(procedure: Procedure, arm: str) -> dict[str, Any]:
 
 def plan(summary: dict[str, Any]) -> View:
     """Positions of the sockets, and the predicted uncertainty, compared with that of random poses."""
+    yield from _answer(summary)
     sockets = pluralise(len(summary["sockets"]), "socket")
     yield [Styled(summary["arm"]), f": {summary['poses']} poses in {sockets}"]
     yield listed("", summary["sockets"], {
@@ -150,6 +151,7 @@ def plan(summary: dict[str, Any]) -> View:
 
 def kit_plan(summary: dict[str, Any]) -> View:
     """Where artefacts are put, how many poses each gets, and the predicted uncertainty, also without each part."""
+    yield from _answer(summary)
     yield [Styled(summary["arm"]), f": {pluralise(summary['poses'], 'pose')}"]
     rows = []
     for row in summary["observations"]:
@@ -169,6 +171,21 @@ def kit_plan(summary: dict[str, Any]) -> View:
         without[f"without {name}: {pluralise(poses, 'pose')}"] = prediction
     yield from _predictions(summary, "places", without)
     yield from written_of(summary)
+
+
+def _answer(summary: dict[str, Any]) -> View:
+    """How good a calibration with this plan will be."""
+    predicted = summary["predicted"]
+    if predicted is None or not math.isfinite(predicted["largest_mm"]):
+        yield Styled(
+            "With these poses, a calibration does not determine lengths everywhere in the working volume.", "red"
+        )
+        return
+    median, largest = (two_digits(COVERAGE_FACTOR * predicted[f"{which}_mm"]) for which in ("median", "largest"))
+    yield Styled(
+        f"A calibration with these {pluralise(summary['poses'], 'pose')} contributes {median} mm to U of a length of "
+        f"{summary['check_length_mm']:g} mm ({K_IN_WORDS}; at worst {largest} mm)."
+    )
 
 
 def _predictions(summary: dict[str, Any], where: str, without: dict[str, Any] | None = None) -> View:

@@ -5,8 +5,8 @@ freedom, if poses scatter alike everywhere and the model is as certain as its co
 more: a robot's errors depend on where it is, and a model that was chosen by the data, with scales that they taught it,
 predicts other regions less well than it says. Ratios of found to predicted mean squares, of groups that were held
 out, show both: their median m, and by what their relative variance exceeds that of chance, tau^2 (by moments, as
-DerSimonian and Laird 1986, Controlled Clinical Trials 7, 177-188, but from the median deviation, so that a group that
-contradicts the others hides no second one). A further group then has the mean square m times the predicted one, with
+DerSimonian and Laird 1986, Controlled Clinical Trials 7, 177-188, without groups that contradict the others, which else
+would hide further ones). A further group then has the mean square m times the predicted one, with
 1/f' = 1/f + tau^2/2, and m is known as well as so many groups say.
 """
 
@@ -18,7 +18,7 @@ import numpy as np
 # Relative variance of mean squares between groups that is expected beforehand, a standard deviation of 11 % of the RMS,
 # and how many groups that counts as: two or three groups that agree do not show that all others do.
 _EXPECTED, _WEIGHT = 0.05, 2.0
-_OF_NORMAL = 1.4826  # standard deviation of a normal variable over its median deviation
+_CONTRADICTS = 3.0  # times the median ratio, above which a group contradicts the others: 1.7 times their RMS
 
 
 class BetweenGroups(NamedTuple):
@@ -36,9 +36,11 @@ class BetweenGroups(NamedTuple):
         values, number = values[usable], int(usable.sum())
         if number < 2:
             return None
-        by_chance, middle = float(np.mean(2 / freedom[usable])), float(np.median(values))
-        scatter = _OF_NORMAL * float(np.median(np.abs(values - middle))) / max(middle, 1e-300)
-        excess = max(scatter**2 - by_chance, 0.0)
+        middle = float(np.median(values))
+        alike = values <= _CONTRADICTS * middle
+        by_chance, number = float(np.mean(2 / freedom[usable][alike])), int(alike.sum())
+        relative = np.var(values[alike], ddof=1) / np.mean(values[alike]) ** 2 if number > 1 else 0.0
+        excess = max(float(relative) - by_chance, 0.0)
         variance = ((number - 1) * excess + _WEIGHT * _EXPECTED) / (number - 1 + _WEIGHT)
         return cls(max(middle, 1.0), variance, 2 * number / (variance + by_chance))
 

@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
 from aacmm_jax.diagnostics import reading_check, reading_search
-from aacmm_jax.diagnostics.reading_check import check_readings
+from aacmm_jax.diagnostics.reading_check import check_readings, explanation_words
 from aacmm_jax.diagnostics.reading_fit import Explanation, ReadingFit
 from aacmm_jax.diagnostics.reading_search import Evidence, Hypothesis, search
+from aacmm_jax.files.reading_checks import angles_toml
 
 DEG = np.pi / 180
 NONE = (0.0,) * 7
@@ -250,3 +251,17 @@ def test_alternatives_leave_alone_a_joint_that_stands_still(paper_arm, few):
     q[:, 4] = 0.4
     found = check_readings(paper_arm, q, positions=np.asarray(paper_arm.position(q)), own_frame=True)
     assert [(one.order, one.signs) for one in found.others] == [(PLAIN[:6], (-1, 1, 1, 1, 1, 1))]
+
+
+@pytest.mark.parametrize("own_frame", [True, False])
+def test_servos_have_one_middle(few, own_frame):
+    """Counts of servos whose middle, 2048 of 4096, was not stated: a zero common to all joints, within the limits."""
+    arm, random = aj.load_arm("so100"), np.random.default_rng(2)
+    low, high = np.asarray(arm.limits).T
+    q = random.uniform(0.9 * low + 0.1 * high, 0.1 * low + 0.9 * high, (40, 5))
+    check = aj.diagnostics.check_readings(arm, q + np.pi, positions=np.array(arm.position(q)), own_frame=own_frame)
+    assert np.allclose(check.best.offsets, -np.pi, atol=0.02)
+    assert check.best.outside == 0
+    assert not check.others
+    assert explanation_words(check.best) == "the zeros of all joints are 180 deg off"
+    assert angles_toml(check.best, "deg") == '[angles]\nunit = "deg"\noffset = [180, 180, 180, 180, 180]\n'
