@@ -72,7 +72,8 @@ def test_python_prints_what_it_says(capsys):
 @pytest.mark.usefixtures("clone")
 def test_commands_print_what_it_says(aacmm, tmp_path):
     printed = [" ".join(aacmm(*re.sub('"', "", command).split()).stdout.split()) for command in COMMANDS]
-    said = "held-out poses deviate by 0.245 mm RMS from their geometry, where 0.401 mm was predicted"
-    assert said in printed[2]
-    assert "deviate by 0.245 mm RMS from their geometry, where 0.401 mm was predicted" in " ".join(README.split())
+    assert "RMS distance of poses from their socket's centroid or 0.3296 0.3819" in printed[0]
+    assert "RMS error of reference lengths 0.1732" in printed[0]
+    said = "0.330 mm RMS from each other's centroid, where 0.382 mm was predicted, and lengths of 50 mm are wrong by 0.173"
+    assert said in " ".join(README.split())
     assert (tmp_path / "report.html").stat().st_size > 1e5
