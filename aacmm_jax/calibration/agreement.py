@@ -190,7 +190,8 @@ class CrossValidation(NamedTuple):
                 # A sum of squares of independent parts with means T and degrees of freedom f has
                 # (sum T)^2 / sum (T^2 / f) of them (Satterthwaite).
                 count, rms, predicted, freedom = np.array(usable).T
-                freedom = freedom if between is None else between.scatter(freedom)
+                if between is not None:
+                    freedom = np.array([between.scatter(float(of_group)) for of_group in freedom])
                 means = count * predicted**2
                 ratio = math.sqrt(np.sum(count * rms**2) / means.sum())
                 pooled.append(chance(ratio, 1.0, float(means.sum() ** 2 / np.sum(means**2 / freedom)), of_noise))

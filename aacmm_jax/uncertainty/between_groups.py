@@ -39,8 +39,8 @@ class BetweenGroups(NamedTuple):
         middle = float(np.median(values))
         alike = values <= _CONTRADICTS * middle
         by_chance, number = float(np.mean(2 / freedom[usable][alike])), int(alike.sum())
-        relative = float(np.var(values[alike], ddof=1)) / np.mean(values[alike]) ** 2 if number > 1 else 0.0
-        excess = max(relative - by_chance, 0.0)
+        relative = np.var(values[alike], ddof=1) / np.mean(values[alike]) ** 2 if number > 1 else 0.0
+        excess = max(float(relative) - by_chance, 0.0)
         variance = ((number - 1) * excess + _WEIGHT * _EXPECTED) / (number - 1 + _WEIGHT)
         return cls(max(middle, 1.0), variance, 2 * number / (variance + by_chance))
 

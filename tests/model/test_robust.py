@@ -24,7 +24,8 @@ def test_tuning_constants_of_one_row_are_the_published_ones(name, constant):
 @pytest.mark.parametrize("rows", [1, 2, 3, 4, 6])
 @pytest.mark.parametrize("name", LOSSES)
 def test_tuning_constants_give_95_percent(name, rows):
-    """Efficiency of the estimate of a shift, A^2 / B with A = E[w + 2/r w' |x|^2] and B = E[w^2 |x|^2] / r."""
+    """Efficiency of the estimate of a shift, A^2 / B with A = E[w + 2/r w' |x|^2] and B = E[w^2 |x|^2] / r; more where
+    the constant is the least, with which a quarter of good poses has a smaller residual."""
     loss = Loss(name)
     root = np.linspace(1e-6, 9.0, 200_001)
     square = root**2
@@ -35,7 +36,8 @@ def test_tuning_constants_give_95_percent(name, rows):
     slope = np.gradient(weight, square)
     a = np.trapezoid((weight + 2 / rows * slope * square) * density, root)
     b = np.trapezoid(weight**2 * square * density, root) / rows
-    assert a**2 / b == pytest.approx(0.95, abs=2e-3)
+    least = tuning_constant(name, rows) <= stats.chi(rows).ppf(0.25) + 1e-3
+    assert a**2 / b > 0.948 if least else a**2 / b == pytest.approx(0.95, abs=2e-3)
 
 
 @pytest.mark.parametrize("rows", [40, 1000])
