@@ -76,6 +76,7 @@ def removal(removed: Removed) -> Finding:
         f"{removed.change:.2g} standard uncertainties.",
         probability=removed.probability,
         concerns=removed.members,
+        explains=1.0,  # of what it contradicted, all; it is read before causes of what remains
     )
 
 
