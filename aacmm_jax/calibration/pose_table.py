@@ -3,8 +3,8 @@
 With rows in standard deviations of the noise, A their derivatives by the parameters less what the geometry follows of
 them, G those by the geometry, C the covariance of the parameters and F that of the geometry for given parameters, the
 rows of a pose have the covariance I + A C A^T + G F G^T where neither the arm nor the geometry was fitted to it. Where
-both were, it is I - A S A^T - G F G^T, with the part S of C that follows from the scatter of single poses; functions of
-the readings that the model lacks add what the parameters do not follow of them.
+both were, it is I - A S A^T - G F G^T, with the inverse S of the information that these rows have on the parameters;
+functions of the readings that the model lacks add what the parameters do not follow of them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -94,26 +94,26 @@ def residuals_by_pose(
     weights = [np.concatenate([fitted[observed.slices[number]] for number in group.members]).astype(float)
                for group in observed.layout.groups]  # fmt: skip
     linear = linear._replace(weights=[*weights, *linear.weights[len(weights) :]])
-    of_used = _scatter_of(uncertainty, model)
+    *derivatives, information = _derivatives(linear)
+    of_used = _covariance_of_used(uncertainty, information[:model, :model])
     rows = []
-    for part, by_parameters, by_geometry in zip(linear.parts(), *_derivatives(linear), strict=True):
+    for part, by_parameters, by_geometry in zip(linear.parts(), *derivatives, strict=True):
         masks = used[part.poses], fitted[part.poses]
         derivatives = np.asarray(by_parameters), np.asarray(by_geometry)
         rows.append(_of_part((uncertainty, of_used), part, masks, *derivatives))
     return _concatenated(rows)
 
 
-def _scatter_of(uncertainty: Uncertainty, model: int) -> Float[np.ndarray, "p p"]:
-    """What is added to the covariance of used poses: less the part of the covariance of the parameters that follows
-    from their scatter; and that of the functions that the model lacks, the last parameters of the complete uncertainty,
-    with what the parameters follow of them."""
-    covariance, components = np.asarray(uncertainty.covariance), uncertainty.components
-    others = 0.0 if components is None else np.sum(np.asarray(components.matrices), axis=0)
-    scatter = np.zeros_like(covariance)
-    scatter[:model, :model] = (covariance - others)[:model, :model]
+def _covariance_of_used(uncertainty: Uncertainty, information: Float[np.ndarray, "q q"]) -> Float[np.ndarray, "p p"]:
+    """What is added to the covariance of used poses: less S; and that of the functions that the model lacks, the last
+    parameters of the complete uncertainty, with what the parameters follow of them."""
+    covariance, model = np.asarray(uncertainty.covariance), len(information)
+    fitted = np.zeros_like(covariance)
+    steps = np.asarray(uncertainty.space.scale)[:model]
+    fitted[:model, :model] = np.outer(steps, steps) * np.linalg.pinv(information, rcond=_NULL, hermitian=True)
     moments = covariance[model:, model:]
     follow = np.concatenate([covariance[:model, model:] @ np.linalg.pinv(moments), np.eye(len(moments))])
-    return follow @ moments @ follow.T - scatter
+    return follow @ moments @ follow.T - fitted
 
 
 def noise_of_poses(uncertainty: Uncertainty) -> Noise:
@@ -124,9 +124,9 @@ def noise_of_poses(uncertainty: Uncertainty) -> Noise:
     return eqx.tree_at(lambda n: n.seating, noise, np.hypot(noise.seating, shared.sd_of(VISITS, SUCCESSIVE)))
 
 
-def _derivatives(linear: Linearisation) -> tuple[list[AnyArray], list[AnyArray]]:
+def _derivatives(linear: Linearisation) -> tuple[list[AnyArray], list[AnyArray], np.ndarray]:
     """Of the whitened rows of each observation, with the poses last: A, by mm and rad of the parameters; and G times a
-    root of F."""
+    root of F. And the information on the parameters, in natural steps."""
     influence, observed, p = linear.influence(), linear.observed, len(linear.space.names)
     information = np.asarray(influence.information)
     values, vectors = np.linalg.eigh(information[p:, p:])
@@ -145,7 +145,8 @@ def _derivatives(linear: Linearisation) -> tuple[list[AnyArray], list[AnyArray]]
             roots = np.sqrt(np.maximum(values, 0.0))[:, None, :] * vectors
             of_geometry.append(np.asarray(followed(np.asarray(own), roots, block.sizes)))
         by_geometry.append(np.concatenate(of_geometry))
-    return observed.by_observation(by_parameters), observed.by_observation(by_geometry)
+    on_parameters = information[:p, :p] - information[:p, p:] @ follow
+    return observed.by_observation(by_parameters), observed.by_observation(by_geometry), on_parameters
 
 
 def _of_part(

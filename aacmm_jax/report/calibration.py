@@ -124,7 +124,7 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
         introduction += (
             f" Poses alone do not determine the scale, so {record.hold} was held constant in stage 1 (scale anchor)."
         )
-    blocks: list[Block] = [introduction]
+    blocks: list[Block] = [introduction, *(f"Decided by default: {decision}" for decision in record.decisions)]
     if capture.names or not capture.observations:
         sockets = zip(capture.names, capture.sizes, strict=True)
         columns = {"socket": lambda row: row[0], "poses": lambda row: row[1]}

@@ -98,7 +98,7 @@ def _of_lengths(limit: float, rows: Mapping[str, Any], record: EvaluationRecord,
 
     def within(row: Mapping[str, Any]) -> float:
         over, under = ((sign * limit - row["error_mm"]) / row["error_u_mm"] for sign in (1, -1))
-        above, below = (float(student_tail(np.array(x), np.array(freedom))) / 2 for x in (over, under))
+        above, below = (student_tail(np.array([over, under]), np.full(2, freedom)) / 2).tolist()
         return (1 - above if over > 0 else above) - (below if under < 0 else 1 - below)
 
     row = min(known, key=within)

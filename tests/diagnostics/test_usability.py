@@ -15,7 +15,7 @@ LENGTHS = [aj.ReferenceLength("A", "B", 412.3106, 0.005), aj.ReferenceLength("A"
 @pytest.fixture(scope="module")
 def readings(paper_arm):
     noise = aj.Noise(encoder_arcsec=5, seating=0.01)
-    capture = aj.simulate(paper_arm, SOCKETS, poses=30, noise=noise, seed=1)
+    capture = aj.simulate(paper_arm, SOCKETS, poses=60, noise=noise, seed=1)  # more than are checked
     return {name: np.asarray(q) for name, q in capture.sockets.items()}
 
 
@@ -39,6 +39,10 @@ def wrong_sign(q):
     return {name: part * np.where(np.arange(6) == 3, -1, 1) for name, part in q.items()}
 
 
+def wrong_zero(q):
+    return {name: part + np.radians(45) * (np.arange(6) == 2) for name, part in q.items()}
+
+
 def exchanged(q):
     """The rows of B belong to other poses."""
     return q | {"B": np.random.default_rng(0).uniform(-2, 2, q["B"].shape)}
@@ -60,6 +64,7 @@ def made(readings, changed, stated=None):
         (one_pose, None, "unusable", "Most likely: errors of a few poses, the largest in B pose 4."),
         (one_joint, None, "doubt", "Most likely: play or a loose encoder in joint 4."),
         (wrong_sign, None, "unusable", "Likely cause: joint 4 was read with the wrong sign."),
+        (wrong_zero, None, "unusable", "Likely cause: the zero of joint 3 is -45 deg off."),
         (exchanged, None, "unusable", "Most likely: errors in B."),
         (as_read, 0.05, "doubt", "Most likely: bounds that are too narrow (reached: "),
     ],
@@ -72,7 +77,7 @@ def test_reasons(readings, changed, stated, severity, reason):
     assert (why_unusable(record) is not None) == (severity == "unusable")
     for finding in findings:
         assert reason in finding.sentence
-        assert ("Check the columns" in finding.sentence) == (changed is wrong_sign)
+        assert ("Check the columns" in finding.sentence) == (changed in (wrong_sign, wrong_zero))
 
 
 def test_what_was_stated_never_condemns(paper_arm, readings):
@@ -83,7 +88,7 @@ def test_what_was_stated_never_condemns(paper_arm, readings):
     for u, usable in ((5.0, True), (0.01, False)):
         capture = aj.Capture({}, [], [MeasuredPoints("camera", q, points, u=u)])
         record = aj.calibrate_capture(aj.Recording(capture, nominal), automatic=False)
-        assert 7.4 < record.residual < 8.5
+        assert 7.4 < record.residual < 8.9
         assert (record.residual < record.largest_usual_residual) == usable
         assert (why_unusable(record) is None) == usable
 

@@ -286,6 +286,14 @@ def test_a_report_of_observations_by_kind_observation_and_pose(observed_record, 
     np.testing.assert_allclose([pose["points"][-1] for pose in transforms], arm.position(q), atol=0.06)
 
 
+def test_a_report_says_what_was_decided_by_default(observed_record):
+    from aacmm_jax.report.calibration import calibration_report
+
+    decided = "Default bounds were widened where the fit reached them: a_2 (to ±50 mm)."
+    page = calibration_report(observed_record._replace(decisions=(decided,)))
+    assert f"Decided by default: {decided}" in page.sections[0].blocks
+
+
 def test_a_report_says_what_was_left_out(observed_record):
     from aacmm_jax.calibration.record import Removed
     from aacmm_jax.diagnostics.contradictions import removal

@@ -1,13 +1,13 @@
 """Limits are decided by the probability of conformity; what is undecided says what would decide."""
 
 import re
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.acceptance.judgement import RULES, decide, deciding_uncertainty
+from aacmm_jax.acceptance.record import EvaluationRecord
 from aacmm_jax.summaries.maxima import judged_maxima
 
 
@@ -15,9 +15,9 @@ def record(maxima, paper_arm):
     """Joint 2 is read in a small part of its travel."""
     q = np.random.default_rng(0).uniform(-3.1, 3.1, (200, 6))
     q[:, 1] = np.linspace(0.0, 0.2, len(q))
-    lengths = (aj.ReferenceLength("A", "B", 200.0, 0.01),)
-    recording = SimpleNamespace(capture=SimpleNamespace(readings=q, lengths=lengths))
-    return SimpleNamespace(maxima=maxima, recording=recording, calibrated=SimpleNamespace(arm=paper_arm))
+    capture = aj.Capture({"A": q[:100], "B": q[100:]}, [aj.ReferenceLength("A", "B", 200.0, 0.01)])
+    arm = aj.kinematics.ArmSpecification(paper_arm, "arm")
+    return EvaluationRecord(aj.Recording(capture, arm), arm, frozenset(), maxima=maxima)
 
 
 def summary(poses=50, rms=0.1, freedom=None, error=0.1, u=0.02):
@@ -70,10 +70,10 @@ def test_so_many_further_poses_decide(paper_arm):
 
 def test_the_risk_of_a_false_acceptance(paper_arm):
     """Of arms exactly at their limit, one in twenty passes, and one in twenty fails."""
-    random, decisions = np.random.default_rng(1), []
+    random, decisions, evaluated = np.random.default_rng(1), [], record({"rms_mm": 0.1}, paper_arm)
     for _ in range(4000):
         rms = 0.1 * np.sqrt(random.chisquare(54) / 54)
-        (judged,) = judged_maxima(summary(poses=10, rms=rms), record({"rms_mm": 0.1}, paper_arm))
+        (judged,) = judged_maxima(summary(poses=10, rms=rms), evaluated)
         decisions.append(judged.decision)
     shares = [decisions.count(decision) / len(decisions) for decision in ("conforms", "fails")]
     np.testing.assert_allclose(shares, 0.05, atol=0.012)

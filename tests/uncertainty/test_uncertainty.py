@@ -337,5 +337,5 @@ def test_the_working_volume_has_the_u_of_its_lengths(result):
     """One by one, with the coverage factor of each."""
     uncertainty = aj.uncertainty_of(result)
     volume = aj.volumetric_uncertainty(uncertainty, points=5, length=200.0)
-    lengths = uncertainty.expanded_length(volume.start, volume.end)
+    lengths = uncertainty.expanded_length(volume.q, volume.q_end)
     np.testing.assert_allclose(volume.expanded_length, lengths, rtol=1e-9)
