@@ -9,7 +9,7 @@ from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.observations.measured import MeasuredPoints
 from ..kinematics.arm import Arm
-from .reading_check import EXPLAINED, ReadingCheck, checked_fit, reading_fit
+from .reading_check import EXPLAINED, NEVER, ReadingCheck, checked_fit, reading_fit
 from .reading_fit import ReadingFit
 from .reading_search import Hypothesis
 
@@ -22,6 +22,17 @@ def check_capture(arm: Arm, capture: Capture) -> ReadingCheck:
     signs and zeros explain it, couplings of joints are tried."""
     check = checked_fit(reading_fit(arm, **_evidence_of(arm, capture)))
     return check if check.explained else check._replace(couplings=search_couplings(arm, capture))
+
+
+def fits_as_recorded(arm: Arm, capture: Capture) -> bool:
+    """Whether the readings fit an arm whose parameters differ from nominal ones as those of real arms do, so that no
+    other order, signs and zeros have to be searched, which takes seconds. Raises `InputError` as `check_capture`
+    does."""
+    fit, n = reading_fit(arm, **_evidence_of(arm, capture)), arm.joints
+    as_recorded = Hypothesis(tuple(range(n)), (1,) * n, (0.0,) * n)
+    residual, with_zeros = fit.explanation(as_recorded).rms_fitted, fit.with_free_zeros(as_recorded)[1]
+    possible = float(np.abs(fit.evidence.q).max()) <= NEVER
+    return possible and residual <= EXPLAINED * fit.size and residual <= fit.as_good_as(with_zeros)
 
 
 def _evidence_of(arm: Arm, capture: Capture) -> dict[str, Any]:

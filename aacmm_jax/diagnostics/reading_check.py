@@ -34,7 +34,7 @@ _REFITTED = 24  # hypotheses
 _EQUAL = 1e-6, 2e-4  # of a residual, and mm: the same cost but for rounding
 _LISTED = 200  # hypotheses of equal cost that are looked at
 _TURN = 2 * np.pi * 1.02  # rad; readings of few joints go further
-_NEVER = 8 * np.pi
+NEVER = 8 * np.pi  # rad; no reading is as large
 _LENGTHS = (M, 1 / M, INCH, 1 / INCH)
 _NEAREST, _FARTHEST = 0.05, 1.3  # of the arm's size: distances of known positions from the base
 _APART = 50 * DEG  # zeros that differ by less are adjusted, not confused
@@ -168,7 +168,7 @@ def checked_fit(fit: ReadingFit) -> ReadingCheck:
         for members in groups:
             members.sort(key=lambda hypothesis: (fit.outside(hypothesis) > 0, hypothesis.changes))
             candidates.append((members, *fit.with_free_zeros(members[0])))
-    possible = float(np.abs(evidence.q).max()) <= _NEVER
+    possible = float(np.abs(evidence.q).max()) <= NEVER
     bound = fit.as_good_as(min([rms for *_, rms in candidates] + [given.rms_fitted] * possible))
     good = [(members, fit.needed_zeros(members[0], zeros, rms)) for members, zeros, rms in candidates if rms <= bound]
     explanations = [explanation for _, explanation in good] + [given] * (possible and given.rms_fitted <= bound)
@@ -202,7 +202,7 @@ def _units(fit: ReadingFit) -> Iterator[tuple[float, float]]:
     """Factors of readings and of positions that are possible: 1, and others where the numbers look like them."""
     evidence, size = fit.evidence, fit.size
     largest = float(np.abs(evidence.q).max())
-    angles = [1.0] if largest <= _NEVER else []
+    angles = [1.0] if largest <= NEVER else []
     angles += [DEG] if largest > _TURN else [1 / DEG] if 0 < largest < _TURN * DEG else []
     lengths = [1.0]
     if evidence.points is not None:

@@ -17,7 +17,7 @@ from ..data.noise import CLASSES, ArmNoise, class_noise
 from ..data.observations.measured import MeasuredPoints
 from ..data.observations.observation import AbstractObservation
 from ..data.recording import Recording
-from ..diagnostics.capture_check import check_capture
+from ..diagnostics.capture_check import check_capture, fits_as_recorded
 from ..diagnostics.reading_check import explanation_words
 from ..diagnostics.reading_fit import Explanation
 from ..diagnostics.usability import many_on_bounds
@@ -76,6 +76,8 @@ def with_corrected_readings(
         return record, None
     recording = record.recording
     try:
+        if fits_as_recorded(recording.nominal.arm, recording.capture):
+            return record, None
         check = check_capture(recording.nominal.arm, recording.capture)
     except InputError:  # neither sockets nor points, or too few
         return record, None
