@@ -87,7 +87,7 @@ def mistake_in_data(case: Case) -> str:
     if cause := likely_cause(arm, capture):
         return cause
     if len(capture.readings) > _CHECKED:
-        capture = draw_poses(capture, _CHECKED)[0]
+        capture = draw_poses(capture, _CHECKED)
     try:
         check = check_capture(arm, capture)
     except InputError:  # neither two poses in a socket nor measured points

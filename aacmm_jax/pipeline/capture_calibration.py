@@ -142,11 +142,12 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         record = chosen.stage("Calibrating", lambda: recorded(solved(recording), recording))
         record = record._replace(decisions=decided)
         if automatic:
+            # First, as a search of seconds; that of orders, signs and zeros takes ten times as long.
+            further = chosen.model is None and nominal.arm.corrections is None
+            record = chosen.stage("Checking couplings", lambda: with_full_couplings(record, solved, recorded, further))
             check = lambda: with_corrected_readings(record, solved, recorded)  # noqa: E731
             record, explanation = chosen.stage("Checking readings", check)
             capture = capture if explanation is None else corrected_capture(capture, explanation) or capture
-            further = chosen.model is None and nominal.arm.corrections is None
-            record = chosen.stage("Checking couplings", lambda: with_full_couplings(record, solved, recorded, further))
             record = chosen.stage("Checking bounds", lambda: with_wider_bounds(record, solved, recorded))
         if automatic or chosen.remove_contradicting:
             record = chosen.stage("Comparing groups", lambda: without_contradicting(record, solved, recorded))

@@ -15,7 +15,7 @@ LENGTHS = [aj.ReferenceLength("A", "B", 412.3106, 0.005), aj.ReferenceLength("A"
 @pytest.fixture(scope="module")
 def readings(paper_arm):
     noise = aj.Noise(encoder_arcsec=5, seating=0.01)
-    capture = aj.simulate(paper_arm, SOCKETS, poses=30, noise=noise, seed=1)
+    capture = aj.simulate(paper_arm, SOCKETS, poses=60, noise=noise, seed=1)  # more than are checked
     return {name: np.asarray(q) for name, q in capture.sockets.items()}
 
 
@@ -88,7 +88,7 @@ def test_what_was_stated_never_condemns(paper_arm, readings):
     for u, usable in ((5.0, True), (0.01, False)):
         capture = aj.Capture({}, [], [MeasuredPoints("camera", q, points, u=u)])
         record = aj.calibrate_capture(aj.Recording(capture, nominal), automatic=False)
-        assert 7.4 < record.residual < 8.5
+        assert 7.4 < record.residual < 8.9
         assert (record.residual < record.largest_usual_residual) == usable
         assert (why_unusable(record) is None) == usable
 
