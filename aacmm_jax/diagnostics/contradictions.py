@@ -12,6 +12,7 @@ from ..core.errors import InputError
 from ..core.units import DEG
 from ..data.capture import Capture, names_in, part_of
 from ..data.observations.held import Socket
+from .culprits import culprits_of
 from .equations import EXACT, PROBE, Block, Equations, GroupTest, Rows, contradicting_groups, different_groups, fit_of
 from .findings import Case, Finding, case_of, chance_text
 
@@ -25,6 +26,7 @@ _LEAST_RATIO = 9.0
 _LEAST_DIFFERENCE, _LEAST_REMOUNTED = 16.0, 50.0
 _LEVEL = 0.01
 _EXPLAINS = 0.67  # share of a contradiction that a single cause must explain to be named
+_AMID = 2  # poses of a group before and after a change, by which it lies within the group and not at its border
 _LARGE = ("session", "station")  # kinds of groups with more poses than parameters
 _NAMED_ALIKE = ("socket", "observation")  # kinds whose groups are chosen by their own names
 
@@ -74,6 +76,7 @@ def removal(removed: Removed) -> Finding:
         f"{removed.change:.2g} standard uncertainties.",
         probability=removed.probability,
         concerns=removed.members,
+        explains=1.0,  # of what it contradicted, all; it is read before causes of what remains
     )
 
 
@@ -168,7 +171,9 @@ def contradictions_of(record: CalibrationRecord) -> list[Contradiction]:
 
 
 def _contradictions(case: Case) -> list[Contradiction]:
-    equations, kinds = case.equations, groupings(case.record.recording.capture)
+    if changed_within_a_group(case):
+        return []
+    equations, kinds = without_bad_poses(case), groupings(case.record.recording.capture)
     best: list[list[GroupTest]] = []
     kind, labels = "", {}
     for candidate, groups in kinds.items():
@@ -184,6 +189,26 @@ def _contradictions(case: Case) -> list[Contradiction]:
     contradictions = [Contradiction(kind, tuple(_suspect(equations, labels, test) for test in group)) for group in best]
     negligible = contradictions and contradictions[0].suspects[0].rms_others[0] < EXACT
     return [] if negligible else contradictions
+
+
+def changed_within_a_group(case: Case) -> bool:
+    """Whether something changed at a pose amid a group, which explains why groups before and after it differ."""
+    firsts = [
+        culprit.term.term.first
+        for culprit in culprits_of(case)
+        if culprit.term is not None and culprit.term.term.first >= 0 and culprit.explains > _EXPLAINS
+    ]
+    amid = [part.poses[_AMID:-_AMID] for part in case.equations.rows]
+    return any(first in poses for first in firsts for poses in amid)
+
+
+def without_bad_poses(case: Case) -> Equations:
+    """The equations without single poses that explain the residuals: no group is wrong because one of its poses is."""
+    bad = [culprit.number for culprit in culprits_of(case) if culprit.kind == "pose"]
+    if not bad:
+        return case.equations
+    rows = [part.at(~np.isin(part.poses, bad)) for part in case.equations.rows]
+    return case.equations._replace(rows=[part for part in rows if len(part.poses)])
 
 
 def _different(
@@ -227,7 +252,8 @@ def _cause(equations: Equations, members: Sequence[str]) -> Cause | None:
     apart = sum(fit_of([block for block in blocks if block.group in (group, None)]).cost for group in ("", "members"))
     contradicted = max(whole.cost - apart, 1e-300)
     best = None
-    for names in (*((name,) for name in equations.extra if name not in PROBE), PROBE):
+    joints = equations.extra.index(PROBE[0])
+    for names in (*((name,) for name in equations.extra[:joints]), PROBE):
         fitted = fit_of(equations.blocks(members, names))
         added = whole.degrees_of_freedom - fitted.degrees_of_freedom
         gain, variance = whole.cost - fitted.cost, max(fitted.cost / max(fitted.degrees_of_freedom, 1), 1e-300)

@@ -21,7 +21,7 @@ from ..calibration.task import without_lengths
 from ..core.distributions import f_tail
 from ..core.numpy_or_jax import to_numpy
 from ..data.noise import Noise
-from ..kinematics.arm import by_joint, is_length, value_of
+from ..kinematics.arm import by_joint, is_length, parameter_names, value_of, without_corrections
 from ..kinematics.parameters import Parameters
 from ..model.observed import Observed
 from ..uncertainty.linearisation import Linearisation
@@ -209,6 +209,14 @@ class Rows(NamedTuple):
         """Some of the poses."""
         return Rows(self.name, *(part[poses] for part in self[1:]))
 
+    def whitened(self, covariance: Float[np.ndarray, "m r r"]) -> "Rows":
+        """The same poses in standard deviations of another noise, whose covariance is given in those of the present."""
+        factor = np.linalg.cholesky(0.5 * (covariance + covariance.swapaxes(1, 2)))
+        root = np.linalg.inv(factor)
+        columns = {name: root @ getattr(self, name) for name in ("shared", "private", "extra", "by_tip")}
+        residual = np.einsum("mab,mb->ma", root, self.residual)
+        return self._replace(residual=residual, in_mm=self.in_mm @ factor, **columns)
+
     def squares(self, step: Float[np.ndarray, " s"]) -> Float[np.ndarray, " m"]:
         """Squared distance of each pose from the geometry, mm^2, after a step; its own geometry follows."""
         moved = self.residual + self.shared @ step
@@ -222,8 +230,9 @@ class Equations(NamedTuple):
 
     rows: list[Rows]  # of the observations, sockets first; sockets with one pose are not among them
     relations: list[Block]  # of reference lengths and certified values, which belong to no group
-    extra: tuple[str, ...]  # zeros of the joints, and the probe
+    extra: tuple[str, ...]  # zeros of the joints, the probe, and other parameters that are no unknowns
     steps: Float[np.ndarray, " e"]  # their natural steps, rad and mm
+    anchor: str | None  # the length among these that is kept, because with it the arm and its residuals could shrink
 
     def blocks(self, members: Sequence[str] = (), names: Sequence[str] = ()) -> list[Block]:
         """All in one group; with some of ``extra`` as unknowns that only certain observations have."""
@@ -245,6 +254,8 @@ def equations_of(record: CalibrationRecord) -> Equations:
     scaled = record.prior is not None or any(o.fixes_scale for o in record.recording.capture.observations)
     anchor = None if in_solve else record.hold if scaled else scale_anchor_of(record)
     names = tuple(name for name in record.names if name != anchor)
+    of_arm = parameter_names(without_corrections(record.calibrated.arm))
+    extra += tuple(name for name in of_arm if name not in (*names, *extra))
     every = (*names, *(name for name in extra if name not in names))
     linear = linearisation_of(record, every, noise=record.noise, lengths=in_solve)
     observed, p, free = linear.observed, len(every), len(names)
@@ -292,7 +303,7 @@ def equations_of(record: CalibrationRecord) -> Equations:
         by = np.eye(len(chosen))[stated] * (weight * steps[:free])[stated][:, None]
         relations.append(Block(PRIOR, None, residual, by, np.zeros((len(stated), 0))))
     natural = np.array([1.0 if is_length(name) else 1e-3 for name in extra])
-    return Equations(rows, relations if len(u) else relations[1:], extra, natural)
+    return Equations(rows, relations if len(u) else relations[1:], extra, natural, anchor)
 
 
 def in_chunks(equations: Equations) -> tuple[list[Rows], list[Block]]:

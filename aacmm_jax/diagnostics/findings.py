@@ -55,6 +55,8 @@ class Finding(NamedTuple):
     doubt: str = ""  # the same in a few words, for the first line of a result
     probability: float | None = None  # of such data where nothing is wrong, where a test says so
     concerns: tuple[str, ...] = ()  # parameters, sockets, observations, lengths and joints ("joint 2")
+    # Part of the excess of the squared residuals over what is expected that this explains, where that is known.
+    explains: float | None = None
 
     @property
     def sentence(self) -> str:
@@ -232,7 +234,13 @@ def findings_of(
     if case.record.plausible_scale:
         plausible |= {"scale"} | ({"fit"} if not case.record.implausible_residual else set())
     findings = [finding for module in diagnostics() if module.NEEDS in plausible for finding in case.once(module.test)]
-    return sorted(findings, key=lambda finding: _SEVERITIES.index(finding.severity))
+    return sorted(findings, key=_rank)
+
+
+def _rank(finding: Finding) -> tuple[bool, float, int]:
+    """Results that are not to be used first; then what explains most of the residuals; then by how serious it is."""
+    explains = -1.0 if finding.explains is None else finding.explains
+    return finding.severity != "unusable", -explains, _SEVERITIES.index(finding.severity)
 
 
 def warnings_of(

@@ -10,6 +10,7 @@ from ..core.text import shorten
 from .findings import Case, Finding
 
 ORDER, NEEDS = 50, "scale"
+_AGREE = 1.1  # times what is predicted, up to which poses agree with their prediction
 
 
 def test(case: Case) -> list[Finding]:
@@ -45,6 +46,8 @@ def contradicted_prediction(validation: CrossValidation) -> list[Finding]:
             ),
         )
         return [finding._replace(severity="doubt", doubt=doubt, concerns=concerns)]
+    # Whatever the model of the joints lacks moves the poses too.
+    of_lengths = validation.rms_predicted > 0 and validation.rms < _AGREE * validation.rms_predicted
     ratios = []
     for name, error, predicted in (
         ("poses", validation.rms, validation.rms_predicted),
@@ -58,11 +61,15 @@ def contradicted_prediction(validation: CrossValidation) -> list[Finding]:
         f"When each placement is held out in turn, the errors are larger than predicted: {'; '.join(ratios)}"
         + (f"; worst in {named}" if named else "")
         + (
-            ". Typical causes are effects outside the D-H model (compliant joints, eccentric encoders), whose errors "
-            "are similar in neighbouring poses."
+            ". The poses agree with their prediction, so a reference length is wrong, or a socket at its ends moved."
+            if of_lengths
+            else ". Typical causes are effects outside the D-H model (compliant joints, eccentric encoders), whose "
+            "errors are similar in neighbouring poses."
         ),
-        "Every stated uncertainty is too small.",
-        "Use the cross-validated values.",
+        "Lengths that are measured with the arm are wrong by as much."
+        if of_lengths
+        else "Every stated uncertainty is too small.",
+        "Measure the reference lengths again." if of_lengths else "Use the cross-validated values.",
     )
     return [finding._replace(severity="doubt", doubt=doubt, concerns=concerns)]
 

@@ -14,26 +14,16 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.numpy_or_jax import to_numpy
-from ..core.text import shorten
-from ..core.units import ARCSEC
 from ..kinematics.arm import DOWN, Arm
 from ..kinematics.chain import forward_pass, joint_motion
 from ..kinematics.corrected_arm import function_values
 from ..kinematics.correction_kinds import Term
-from ..kinematics.corrections import all_sought, model_of, model_with, terms_of
-from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
-from .equations import Block, Rows, wider
-from .findings import Case, Finding, by_equations, chance_text, rounded
-from .residual_tests import LEVEL, Residuals, ScoreTest, score_tests
+from ..kinematics.corrections import KINDS, all_sought, model_of, model_with, terms_of
+from .equations import Rows
+from .residual_tests import ScoreTest
 
-ORDER, NEEDS = 60, "fit"
-MOST_TERMS = 6  # that are looked for one after the other
-_AS_WELL = 6.0  # difference of the information criterion (Akaike 1974) below which another term explains as much
-# Part of the residuals. A step of a joint, 1 mrad, turns the residuals themselves by 1e-3 of their size, and so does
-# the frame of a station that imitates it: in what is left of its column after the frame, linear equations are wrong.
-_SECOND_ORDER = 3e-3
 # Terms that no kind of joint correction has: what residuals follow, of joint {i}, and what causes that.
-_OTHERS: dict[str, tuple[str, str]] = {
+_WORDS: dict[str, tuple[str, str]] = {
     "zero": ("a zero offset of joint {i}, which is fixed", "a wrong zero offset"),
     "drifting zero": ("a drift of joint {i} from pose to pose", "a zero offset that drifts"),
     "drifting base": ("a drift of the tip from pose to pose", "a base or socket that moves"),
@@ -48,6 +38,17 @@ class MissingTerm(NamedTuple):
     joint: int | None  # from 1; None: of the tip
     values: Float[np.ndarray, "N _k"] | Float[np.ndarray, "N 3 _k"]  # pose by pose, for coefficients of 1
     relative: bool = False  # whether its size is that of the coefficient
+    follows: str = ""  # what residuals follow then, in words
+    cause: str = ""  # what causes that
+    concerns: str = "tip"  # the joint, socket or observation
+    column: int | None = None  # of `Rows.extra`, where that is not the joint's
+    first: int = -1  # pose from which on it applies, of a step
+    correction: tuple[str, str] | None = None  # model and option of the joint correction that describes it
+
+    @property
+    def source(self) -> int | None:
+        """The column of `Rows.extra` by which it moves the rows; None: it moves the tip."""
+        return self.joint - 1 if self.column is None and self.joint is not None else self.column
 
 
 class FoundTerm(NamedTuple):
@@ -56,71 +57,15 @@ class FoundTerm(NamedTuple):
     kind: str
     joint: int | None
     test: ScoreTest
-    probability: float  # Holm's: of all candidates
+    probability: float  # Bonferroni's: of all candidates of its family
     amplitude: float  # half the range of what the term adds over the poses, rad or mm; of a gear ratio, relative
-    alternatives: tuple[tuple[str, int | None], ...]
+    others: tuple[MissingTerm, ...]
     term: MissingTerm
 
-
-def test(case: Case) -> list[Finding]:
-    """Terms that the model lacks, in one finding: each explains what those before it leave."""
-    terms = case.once(missing)
-    if not terms:
-        return []
-    sought, texts, causes = all_sought(), [], []
-    words = {name: (kind.follows, kind.cause) for name, (_, kind) in sought.items()} | _OTHERS
-    for term in terms:
-        if term.term.relative and term.kind != "zero":
-            amplitude = f"{rounded(100 * term.amplitude)} %"
-        else:
-            unit, size = ("mm", 1.0) if term.joint is None else ("arcsec", ARCSEC)
-            amplitude = f"{rounded(term.amplitude / size)} {unit}"
-        follows, cause = words[term.kind]
-        texts.append(f"{follows.format(i=term.joint)} ({amplitude})")
-        causes.append(cause)
-    named = {(term.kind, term.joint) for term in terms}
-    others = dict.fromkeys(other for term in terms for other in term.alternatives if other not in named)
-    likely = [words[kind][0].format(i=joint) for kind, joint in others]
-    model = wider_model(terms, case.record.calibrated.arm)
-    probability = max(term.probability for term in terms)
-    shared = set() if case.record.shared is None else set(case.record.shared.kinds)
-    return [
-        Finding(
-            "missing-terms",
-            f"Residuals follow {shorten(texts, 3)} ({chance_text(probability)}), which the model does not describe. "
-            f"Possible causes: {', '.join(dict.fromkeys(causes))}{f'; try --model {model}' if model else ''}."
-            + (f" Equally likely: {shorten(likely, 3)}." if likely else ""),
-            "The stated uncertainties include these errors as estimated from the residuals."
-            if shared - {PLACES, VISITS, SUCCESSIVE}
-            else "Every stated uncertainty is too small.",
-            severity="doubt",
-            probability=probability,
-            concerns=tuple(dict.fromkeys("tip" if t.joint is None else f"joint {t.joint}" for t in terms)),
-        )
-    ]
-
-
-@by_equations
-def missing(case: Case) -> tuple[FoundTerm, ...]:
-    """The terms that the model of a calibration lacks."""
-    if not case.scatters:
-        return ()
-    return found_terms(case.record.calibrated.arm, np.asarray(case.record.recording.capture.readings), *case.chunks)
-
-
-@by_equations
-def explained(case: Case) -> tuple[list[Rows], list[Block]]:
-    """The equations of a calibration, with these terms as further unknowns."""
-    (rows, relations), terms = case.chunks, case.once(missing)
-    if not terms:
-        return rows, relations
-    columns = np.concatenate(columns_of([term.term for term in terms], rows), axis=1)
-    parts = np.split(columns, np.cumsum([part.residual.size for part in rows])[:-1])
-    extended = [
-        part._replace(shared=np.concatenate([part.shared, added.reshape(*part.residual.shape, -1)], axis=2))
-        for part, added in zip(rows, parts, strict=True)
-    ]
-    return extended, wider(relations, columns.shape[1])
+    @property
+    def alternatives(self) -> tuple[tuple[str, int | None], ...]:
+        """What explains as much, by kind and joint."""
+        return tuple((term.kind, term.joint) for term in self.others)
 
 
 def wider_model(terms: Sequence[FoundTerm], arm: Arm | None) -> str:
@@ -129,9 +74,15 @@ def wider_model(terms: Sequence[FoundTerm], arm: Arm | None) -> str:
     present = [term for term in functions if isinstance(term, Term)]
     sought, added = all_sought(), []
     joints = max(1 if arm is None else arm.joints, *(term.joint or 1 for term in terms))
-    for kind, default in (sought[term.kind] for term in terms if term.kind in sought):
+    for term in terms:
+        if term.term.correction is not None:
+            model, option = term.term.correction
+            added += KINDS[model].terms(joints, option, None)
+        if term.kind not in sought:
+            continue
+        kind, default = sought[term.kind]
         # All of its default functions where the model has none yet, as a first harmonic is seldom alone.
-        option = default.option if any(term.kind.model == kind.model for term in present) else ""
+        option = default.option if any(other.kind.model == kind.model for other in present) else ""
         added += kind.terms(joints, option, None)
     wider = model_of([*present, *added]) if added else ""
     return "" if present and wider == model_of(present) else wider
@@ -144,7 +95,8 @@ def columns_of(terms: Sequence[MissingTerm], rows: Sequence[Rows]) -> list[Float
         blocks = []
         for part in rows:
             values = term.values[part.poses]
-            moved = part.by_tip @ values if term.joint is None else part.extra[..., [term.joint - 1]] * values[:, None]
+            source = term.source
+            moved = part.by_tip @ values if source is None else part.extra[..., [source]] * values[:, None]
             blocks.append(moved.reshape(part.residual.size, -1))
         columns.append(np.concatenate(blocks))
     return columns
@@ -158,16 +110,23 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
     arm = to_numpy(arm)
     order = np.linspace(-1.0, 1.0, len(q))[:, None]
     tip = np.moveaxis(np.asarray(forward_pass(arm.geometry, joint_motion(arm.geometry, q)).tip), -1, 0)[:, :, None]
+
+    def named(kind: str, joint: int | None, values: np.ndarray, relative: bool = False) -> MissingTerm:
+        follows, cause = words[kind]
+        concerns = "tip" if joint is None else f"joint {joint}"
+        return MissingTerm(kind, joint, values, relative, follows.format(i=joint), cause, concerns)
+
+    words = {name: (sought.follows, sought.cause) for name, (_, sought) in all_sought().items()} | _WORDS
     of_joints, of_tip = (
         [],
         [
-            MissingTerm("drifting base", None, order[:, :, None] * np.eye(3)),
-            MissingTerm("growing arm", None, order[:, :, None] * tip / 1e3),  # by 1 mm a m
+            named("drifting base", None, order[:, :, None] * np.eye(3)),
+            named("growing arm", None, order[:, :, None] * tip / 1e3),  # by 1 mm a m
         ],
     )
     for joint in range(1, arm.joints + 1):
-        of_joints.append(MissingTerm("zero", joint, np.ones_like(order), relative=True))
-        of_joints.append(MissingTerm("drifting zero", joint, order))
+        of_joints.append(named("zero", joint, np.ones_like(order), relative=True))
+        of_joints.append(named("drifting zero", joint, order))
     nominal = arm.geometry if arm.corrections is None else arm.corrections.nominal
     gravity = np.asarray(DOWN if arm.gravity is None else arm.gravity)
     for name, (kind, sought) in all_sought().items():
@@ -175,49 +134,10 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
         values = function_values(nominal, terms, q, gravity)
         if kind.of_arm:
             growth = [row for row, term in zip(values, terms, strict=True) if not term.joint and np.ptp(row) > 0]
-            of_tip += [MissingTerm(name, None, row[:, None, None] * tip / 1e3) for row in growth]
+            of_tip += [named(name, None, row[:, None, None] * tip / 1e3) for row in growth]
         for joint in sorted({term.joint for term in terms if term.joint}):
             # A scale has no revolution to repeat, and carries what it moves.
             if joint not in arm.prismatic or sought.of_slides:
                 of_joint = values[[term.joint == joint for term in terms]].T
-                of_joints.append(MissingTerm(name, joint, of_joint, sought.relative))
+                of_joints.append(named(name, joint, of_joint, sought.relative))
     return [*of_joints, *of_tip]
-
-
-def found_terms(
-    arm: Arm, q: Float[np.ndarray, "N n"], rows: Sequence[Rows], relations: Sequence[Block]
-) -> tuple[FoundTerm, ...]:
-    """Terms that the model of a calibrated arm lacks, the one that explains most first; ``q`` are all readings in their
-    order, ``rows`` the equations of the poses, and ``relations`` those of lengths, certified values and priors."""
-    left = Residuals.of([*(part.block("") for part in rows), *relations])
-    candidates, others_rows = missing_terms(arm, q), sum(len(block.residual) for block in relations)
-    columns = [np.pad(values, ((0, others_rows), (0, 0))) for values in columns_of(candidates, rows)]
-    chosen: list[tuple[int, ScoreTest, float, list[int]]] = []
-    rest, least = left, _SECOND_ORDER * float(np.sqrt(left.cost))
-    for _ in range(MOST_TERMS):
-        tests = score_tests(rest, columns, least)
-        number = sum(test.degrees_of_freedom[0] > 0 for test in tests)
-        significant = [i for i, test in enumerate(tests) if test.probability * number < LEVEL]
-        if not significant:
-            break
-        criterion = {}  # Akaike's, less what is common to all
-        for i in significant:
-            remaining = max(rest.cost - tests[i].gain, 1e-300) / rest.cost
-            criterion[i] = len(rest.values) * float(np.log(remaining)) + 2 * tests[i].degrees_of_freedom[0]
-        best, *others = sorted(significant, key=criterion.__getitem__)
-        others = [i for i in others if criterion[i] < criterion[best] + _AS_WELL]
-        chosen.append((best, tests[best], min(tests[best].probability * number, 1.0), others))
-        rest = rest.extended(columns[best])
-    if not chosen:
-        return ()
-    (together,) = score_tests(left, [np.concatenate([columns[i] for i, *_ in chosen], axis=1)], least)
-    coefficients = np.split(together.coefficients, np.cumsum([columns[i].shape[1] for i, *_ in chosen])[:-1])
-    terms = []
-    for (i, test, probability, others), coefficient in zip(chosen, coefficients, strict=True):
-        term = candidates[i]
-        added = (term.values @ coefficient).reshape(len(q), -1)
-        size = abs(coefficient[0]) if term.relative else np.linalg.norm(np.ptp(added, axis=0)) / 2
-        amplitude = float(size) * (1.0 if term.joint is None else 1e-3)
-        alternatives = tuple((candidates[j].kind, candidates[j].joint) for j in others)
-        terms.append(FoundTerm(term.kind, term.joint, test, probability, amplitude, alternatives, term))
-    return tuple(terms)

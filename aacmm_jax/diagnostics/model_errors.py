@@ -16,11 +16,13 @@ from ..calibration.record import CalibrationRecord
 from ..calibration.results import Calibration, Identification
 from ..core.distributions import chi_square_tail, f_tail
 from ..core.text import shorten
+from ..core.units import ARCSEC
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..uncertainty.shared_kinds import SUCCESSIVE, VISITS
+from .culprits import culprits_of, explained, missing, selection
 from .findings import Case, Finding, case_of, chance_text
-from .missing_terms import FoundTerm, explained, missing
+from .missing_terms import FoundTerm
 from .noisy_encoders import NoisyJoint, noisiest_joint
 from .residual_tests import LEVEL, Residuals, alike, form_test, in_succession
 from .scale import Lengths, lengths_of
@@ -57,7 +59,7 @@ class Successive(NamedTuple):
 
 def test(case: Case) -> list[Finding]:
     """Of all residuals together, of single observations, and of successive poses."""
-    findings, misfit, successive = [], case.once(misfit_of), case.once(successive_of)
+    findings, misfit, successive = [], case.once(unexplained_misfit), case.once(successive_of)
     if misfit is not None and misfit.probability < LEVEL:
         findings.append(_misfit(misfit))
     if successive is not None and successive.probability < LEVEL:
@@ -78,7 +80,8 @@ def test(case: Case) -> list[Finding]:
                 probability=successive.probability,
             )
         )
-    noisy = case.once(noisy_observations)
+    said = {culprit.name for culprit in culprits_of(case) if culprit.kind == "scatter"}
+    noisy = [part for part in case.once(noisy_observations) if part.name not in said]
     if noisy:
         texts = [f"{part.name} ({math.sqrt(max(part.ratio, 0)):.2g} times)" for part in noisy]
         findings.append(
@@ -117,17 +120,40 @@ def _misfit(misfit: Misfit) -> Finding:
     )
 
 
-def misfit_of(case: Case) -> Misfit | None:
-    """Residuals against the noise that was given, or that of the arm's class; None where neither is known."""
+def unexplained_misfit(case: Case) -> Misfit | None:
+    """The same of what remains without the causes that are named, and with encoders as noisy as they proved."""
+    if not culprits_of(case) and not case.record.noisy_encoders:
+        return case.once(misfit_of)
+    return misfit_of(case, case.once(selection).remaining)
+
+
+def _usual_with_noisy(case: Case, usual: Noise) -> Noise:
+    """The noise of a class, with that of the encoders whose noise was replaced."""
+    encoder, slides = np.zeros(case.record.calibrated.arm.joints), case.record.calibrated.arm.prismatic
+    for noisy in case.record.noisy_encoders:
+        if noisy.joint not in slides:
+            encoder[noisy.joint - 1] = noisy.found / ARCSEC
+    arcsec = np.maximum(encoder, np.asarray(usual.encoder_arcsec))
+    linear = usual.linear_encoder
+    return Noise(encoder_arcsec=arcsec, seating=usual.seating, linear_encoder=linear)
+
+
+def misfit_of(case: Case, remaining: float | None = None) -> Misfit | None:
+    """Residuals against the noise that was given, or that of the arm's class; None where neither is known.
+
+    ``remaining`` is the part of their squares that no named cause explains, where that is to be tested.
+    """
     usual, given = case.usual, case.record.given_noise is not None
     if not case.shows_noise or not (given or usual is not None):
         return None
     left = case.left
     if usual is not None and not given:
-        left = Case(case.record._replace(noise=usual.noise)).left
-    freedom, ratio = left.degrees_of_freedom, left.cost / left.degrees_of_freedom
+        noise = usual.noise if remaining is None else _usual_with_noisy(case, usual.noise)
+        left = Case(case.record._replace(noise=noise)).left
+    cost, freedom = left.cost * (1.0 if remaining is None else remaining), left.degrees_of_freedom
+    ratio = cost / freedom
     if usual is None or given:
-        upper = chi_square_tail(left.cost, freedom)
+        upper = chi_square_tail(cost, freedom)
         return Misfit(float(np.sqrt(ratio)), freedom, min(2 * min(upper, 1 - upper), 1.0))
     probability = f_tail(ratio, freedom, CLASS_DEGREES_OF_FREEDOM)
     return Misfit(float(np.sqrt(ratio)), freedom, probability, usual.source or usual.arm_class)
@@ -138,7 +164,8 @@ def noisy_observations(case: Case) -> tuple[NoisyObservation, ...]:
     given = case.record.given_noise is not None
     if not case.shows_noise or not case.record.recording.capture.observations:
         return ()
-    rows = case.chunks[0]
+    rows, relations = case.once(explained)
+    left = case.left if not culprits_of(case) else Residuals.of([*(part.block("") for part in rows), *relations])
     names = list(dict.fromkeys(part.name for part in rows))
     if len(names) < 2 and not given:
         return ()
@@ -146,9 +173,14 @@ def noisy_observations(case: Case) -> tuple[NoisyObservation, ...]:
     for name in names:
         sizes = [part.residual.shape if part.name == name else None for part in rows]
         kernels = [None if size is None else np.broadcast_to(np.eye(size[1]), (*size, size[1])) for size in sizes]
-        form = form_test(case.left, kernels, not given)
+        form = form_test(left, kernels, not given)
         tests.append(NoisyObservation(name, form.ratio, form.probability))
-    noisy, tests = [], sorted(tests, key=lambda test: test.probability)
+    noisy = [
+        NoisyObservation(culprit.name, culprit.size, culprit.probability)
+        for culprit in culprits_of(case)
+        if culprit.kind == "scatter"
+    ]
+    tests = sorted(tests, key=lambda test: test.probability)
     for number, test in enumerate(tests):
         probability = min(test.probability * (len(tests) - number), 1.0)
         if probability >= LEVEL:
@@ -161,14 +193,12 @@ def successive_of(case: Case) -> Successive | None:
     """Errors of the tip that successive poses of one observation share (a score test of their covariance)."""
     if not case.shows_noise:
         return None
-    rows, left = case.chunks[0], case.left
+    rows, relations = case.once(explained)
+    left = case.left if not culprits_of(case) else Residuals.of([*(part.block("") for part in rows), *relations])
     # The derivative of the covariance by a correlation with the pose before, and the one after.
     kernels = [alike(part.by_tip, in_succession(len(part.poses))) for part in rows]
     if not any(np.any(kernel) for kernel in kernels):
         return None
-    if case.once(missing):
-        with_terms, relations = case.once(explained)
-        left = Residuals.of([*(part.block("") for part in with_terms), *relations])
     product = total = 0.0
     for part, selected in zip(rows, left.slices, strict=False):
         tips = np.einsum("mrc,mr->mc", part.by_tip, left.values[selected].reshape(part.residual.shape))
@@ -258,7 +288,7 @@ def rows_of_tests(tests: ModelTests) -> dict[str, Any]:
                 "f": term.test.ratio,
                 "degrees_of_freedom": list(term.test.degrees_of_freedom),
                 "probability": term.probability,
-                "alternatives": [{"term": kind, "joint": joint} for kind, joint in term.alternatives],
+                "alternatives": [{"term": other.kind, "joint": other.joint} for other in term.others],
             }
             for term in tests.terms
         ],

@@ -26,9 +26,9 @@ from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import shorten
 from ..data.noise import Noise, one_arcsec
+from .culprits import MOST_CAUSES, culprits_of, explained
 from .equations import Block, Rows
 from .findings import Case, Finding, by_equations, chance_text, reading_text
-from .missing_terms import MOST_TERMS, explained, found_terms, missing
 from .residual_tests import LEVEL, Residuals, chance_above_zero
 
 ORDER, NEEDS = 40, "scale"
@@ -36,7 +36,7 @@ _ROUNDS = 50  # of Fisher scoring; usually 4 to 8
 _TOLERANCE = 1e-3  # of a log variance: a hundredth of its standard uncertainty
 _FACTOR = 1.5  # largest change of a log variance in one round
 _LEAST = 1e-6  # part of the residuals that a variance explains, below which it is 0
-_CLEAR = 1e-4  # probability of a missing term, below which the model is wrong rather than the noise
+_CLEAR = 1e-4  # probability of another cause, below which that is wrong rather than the noise
 _FEWEST = 20  # degrees of freedom below which no variance is estimated by joint
 _FAR_MORE = 100.0  # ratio of noise beyond which the number has no meaning
 
@@ -74,7 +74,8 @@ def test(case: Case) -> list[Finding]:
             )
         )
     noisiest = None if record.implausible_residual else case.once(noisiest_joint)
-    if noisiest is not None and noisiest.probability < LEVEL:
+    said = any(culprit.kind == "noisy joint" for culprit in culprits_of(case))
+    if noisiest is not None and noisiest.probability < LEVEL and not said:
         findings.append(
             Finding(
                 "noisy-encoder",
@@ -159,11 +160,7 @@ class _Equations(NamedTuple):
             covariance = (z * more[:-1]) @ z.swapaxes(1, 2) + more[-1] * t @ t.swapaxes(1, 2)
             # Some noise of its own: where nothing else errs, poses with fewer than three errors would be singular.
             covariance += (1 + 1e-9) * np.eye(z.shape[1])
-            factor = np.linalg.cholesky(0.5 * (covariance + covariance.swapaxes(1, 2)))
-            root = np.linalg.inv(factor)
-            whitened = {name: root @ getattr(rows, name) for name in ("shared", "private", "extra", "by_tip")}
-            residual = np.einsum("mab,mb->ma", root, rows.residual)
-            weighted.append(rows._replace(residual=residual, in_mm=rows.in_mm @ factor, **whitened))
+            weighted.append(rows.whitened(covariance))
         return self._replace(rows=weighted, variances=new)
 
     def estimated(self, groups: Sequence[Sequence[int]]) -> tuple["_Equations", Float[np.ndarray, " k"]]:
@@ -223,9 +220,13 @@ class _Equations(NamedTuple):
 def noisiest_joint(case: Case) -> NoisyJoint | None:
     """The joint in whose direction residuals are larger than in those of the others, with the terms that the model
     lacks taken into account; where even these do not explain the residuals, what they miss looks like noise."""
-    if not case.shows_noise or len(case.once(missing)) == MOST_TERMS:
+    causes = culprits_of(case)
+    for culprit in causes:
+        if culprit.kind == "noisy joint":
+            return NoisyJoint(int(culprit.name.split()[1]), culprit.size, culprit.probability)
+    if not case.shows_noise or len(causes) >= MOST_CAUSES:
         return None
-    if not case.once(missing):
+    if not causes:
         return case.once(_without_terms)[0]
     return _noisiest(case.record, _Equations.of(case.record, *case.once(explained)))[0]
 
@@ -280,10 +281,9 @@ def noise_by_joint(case: Case) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
     stated = equations.variances[:-1] if given else np.full(joints, variances[others[0]])
     if np.any(variances[index] <= stated[index]):
         return None
-    arm, q = record.calibrated.arm, np.asarray(record.recording.capture.readings)
-    if any(term.probability < _CLEAR for term in found_terms(arm, q, now.rows, now.relations)):
+    if any(cause.kind != "noisy joint" and cause.probability < _CLEAR for cause in culprits_of(case)):
         return None
-    kinds = arm.geometry.kinds
+    kinds = record.calibrated.arm.geometry.kinds
     units = np.broadcast_to(one_arcsec(kinds), (joints,))
     expected, sd = np.sqrt(stated) * units, np.sqrt(variances) * units
     noise = Noise(

@@ -1,5 +1,4 @@
-"""Residuals of a calibration pose by pose, in mm and in standard deviations, with the weights of its last solve; and
-poses that are far from their socket, beside what is typical."""
+"""Residuals of a calibration pose by pose, in mm and in standard deviations, with the weights of its last solve."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,35 +8,11 @@ from jaxtyping import Float, Int
 
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord
-from ..core.text import shorten
 from ..data.capture import Capture
 from ..data.observations.observation import AbstractObservation
-from ..model.sockets import pose_outliers
 from .equations import equations_of, linearisation_of
-from .findings import Case, Finding
 
-ORDER, NEEDS = 90, "scale"
 _LEAST_LEVER = 1e-6  # mm per rad: a joint whose axis the tip is on explains nothing
-
-
-def test(case: Case) -> list[Finding]:
-    """Outlying poses of a calibration from sockets alone: robust losses list the poses of all observations."""
-    capture = case.record.recording.capture
-    if capture.observations:
-        return []
-    distances, owner = np.asarray(case.record.evaluations()["calibrated"].distances), capture.owner
-    first = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
-    far, typical = pose_outliers(distances, capture.sizes)
-    worst = sorted(far, key=lambda i: -distances[i])
-    poses = [f"{capture.names[owner[i]]} pose {i - first[owner[i]] + 1}" for i in worst]
-    texts = [f"{pose} ({distances[i]:.3g} mm)" for pose, i in zip(poses, worst, strict=True)]
-    finding = Finding(
-        "outlying-poses",
-        f"Poses far from the centroid of their socket (typical distance: {typical:.2g} mm): {shorten(texts)}.",
-        advice="Check whether the tip was seated in these poses.",
-        concerns=tuple(poses),
-    )
-    return [finding] if poses else []
 
 
 class ObservationResiduals(NamedTuple):

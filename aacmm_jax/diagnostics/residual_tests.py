@@ -61,7 +61,7 @@ class Residuals(NamedTuple):
         return rest - self.basis @ (self.basis.T @ rest)
 
     def extended(self, columns: Float[np.ndarray, "R c"]) -> "Residuals":
-        """The least squares with further unknowns, whose columns are given."""
+        """The least squares with further unknowns, whose columns are given: last in ``basis``."""
         added = _orthonormal(self.unexplained(columns), columns)
         basis = np.concatenate([self.basis, added], axis=1)
         return self._replace(basis=basis, values=self.values - added @ (added.T @ self.values))
@@ -99,33 +99,60 @@ class ScoreTest(NamedTuple):
     coefficients: Float[np.ndarray, " c"]
 
 
+class Candidates(NamedTuple):
+    """Columns of further unknowns, and what the model leaves of them."""
+
+    parts: tuple[slice, ...]  # columns of each candidate
+    lengths: Float[np.ndarray, " c"]  # of the columns before anything was taken from them
+    projected: Float[np.ndarray, "R c"]  # over these lengths
+
+    @classmethod
+    def of(cls, left: Residuals, candidates: Sequence[Float[np.ndarray, "R _"]]) -> "Candidates":
+        """Candidates, each given by its columns."""
+        columns = np.concatenate([np.zeros((len(left.values), 0)), *candidates], axis=1)
+        ends = np.cumsum([candidate.shape[1] for candidate in candidates])
+        lengths = np.linalg.norm(columns, axis=0)
+        lengths = np.where(lengths > 0, lengths, 1.0)
+        parts = tuple(slice(end - c.shape[1], end) for end, c in zip(ends, candidates, strict=True))
+        return cls(parts, lengths, left.unexplained(columns / lengths))
+
+    def less(self, added: Float[np.ndarray, "R a"]) -> "Candidates":
+        """What is left of them by a model with further orthonormal columns."""
+        return self._replace(projected=self.projected - added @ (added.T @ self.projected))
+
+    def tests(self, left: Residuals, least: float = 0.0) -> list[ScoreTest]:
+        """Each against the model. A column of which the model leaves less than ``least`` counts as the model's own."""
+        norms = np.linalg.norm(self.projected, axis=0)
+        present = (norms**2 > _EXPLAINED) & (self.lengths * norms > least)
+        score, tests = np.where(present, left.values @ self.projected, 0.0), []
+        square = np.where(present, norms**2, 1.0)
+        for part in self.parts:
+            width = part.stop - part.start
+            if width == 1:
+                along = score[part] / np.sqrt(square[part])
+                gain, added, step = float(along[0] ** 2), int(present[part][0]), along / np.sqrt(square[part])
+            else:
+                columns = np.where(present[part], self.projected[:, part], 0.0)
+                values, vectors = np.linalg.eigh(columns.T @ columns)
+                seen = values > _EXPLAINED
+                along, added = vectors[:, seen].T @ score[part], int(seen.sum())
+                gain, step = float(np.sum(along**2 / values[seen])), vectors[:, seen] @ (along / values[seen])
+            freedom, step = left.degrees_of_freedom - added, step / self.lengths[part]
+            test = ScoreTest(0.0, 0.0, (added, freedom), 1.0, step)
+            if added and freedom > 0:
+                ratio = gain / added / max((left.cost - gain) / freedom, 1e-300)
+                test = ScoreTest(gain, ratio, (added, freedom), f_tail(ratio, added, freedom), step)
+            tests.append(test)
+        return tests
+
+
 def score_tests(left: Residuals, candidates: Sequence[Float[np.ndarray, "R _"]], least: float = 0.0) -> list[ScoreTest]:
     """Each candidate, given by its columns, against the model, whatever the level of the noise is.
 
     A column of which the model leaves less than ``least`` counts as the model's own; a candidate that the model
     explains itself has the probability 1.
     """
-    if not candidates:
-        return []
-    columns = np.concatenate(candidates, axis=1)
-    lengths = np.linalg.norm(columns, axis=0)
-    lengths = np.where(lengths > 0, lengths, 1.0)
-    projected = left.unexplained(columns / lengths)
-    projected = np.where(lengths * np.linalg.norm(projected, axis=0) > least, projected, 0.0)
-    gram, score, tests, end = projected.T @ projected, projected.T @ left.values, [], 0
-    for candidate in candidates:
-        part = slice(end, end := end + candidate.shape[1])
-        values, vectors = np.linalg.eigh(gram[part, part])
-        present = values > _EXPLAINED
-        along, added = vectors[:, present].T @ score[part], int(present.sum())
-        gain, freedom = float(np.sum(along**2 / values[present])), left.degrees_of_freedom - added
-        step = vectors[:, present] @ (along / values[present]) / lengths[part]
-        test = ScoreTest(0.0, 0.0, (added, freedom), 1.0, step)
-        if added and freedom > 0:
-            ratio = gain / added / max((left.cost - gain) / freedom, 1e-300)
-            test = ScoreTest(gain, ratio, (added, freedom), f_tail(ratio, added, freedom), step)
-        tests.append(test)
-    return tests
+    return Candidates.of(left, candidates).tests(left, least)
 
 
 class Consistency(NamedTuple):

@@ -19,6 +19,7 @@ from ..core.text import shorten
 from ..core.units import INCH, M
 from ..model.observed import Observed
 from ..uncertainty.shared_kinds import PLACES
+from .culprits import culprits_of
 from .equations import EXACT, LEAST_U, PRIOR, Block, Rows, lengths_in_solve, linearisation_of, scale_anchor_of
 from .findings import Case, Finding, chance_text
 from .residual_tests import LEVEL, consistency
@@ -37,6 +38,9 @@ _MISTAKEN_UNITS = {
 }
 # A length is named where chi-square falls below a ninth without it, to what chance exceeds in over 5 % of cases.
 _CLEAR, _AGREE = 9.0, 0.05
+_SET_BY = "scale-set-by-fixed-lengths"
+_MOST_U = 4.0  # standard uncertainties of k, beyond which what fixes the scale is wrong
+_FEW = 2  # lengths, of which each may be the wrong one where they disagree
 
 
 class Lengths(NamedTuple):
@@ -48,13 +52,23 @@ class Lengths(NamedTuple):
     number: int
     odd: str = ""  # the one without which the others agree
     difference: float = 0.0  # of that one from what the others say, mm
+    names: tuple[str, ...] = ()  # of all of them
 
 
 def test(case: Case) -> list[Finding]:
     """Lengths that disagree, at most one finding on k, and one where the arm could not be divided by it."""
     record = case.record
     fits = record.plausible_scale and not record.implausible_residual
-    findings = [finding for finding in (_of_lengths(case) if fits else None, _of_k(record)) if finding is not None]
+    of_lengths, of_k = _of_lengths(case) if fits else None, _of_k(record)
+    if (
+        of_lengths is not None
+        and of_k is not None
+        and of_k.code == _SET_BY
+        and abs(record.k - 1) > _MOST_U * record.u_k
+    ):
+        # What is fixed is wrong, rather than all lengths that contradict it.
+        of_k, of_lengths = of_k._replace(severity="doubt", doubt="fixed lengths contradict the reference lengths"), None
+    findings = [finding for finding in (of_k, of_lengths) if finding is not None]
     if record.against_division and record.plausible_scale:
         findings.append(
             Finding(
@@ -91,7 +105,7 @@ def _of_k(record: CalibrationRecord) -> Finding | None:
         )
     if set_by and record.method == "two-stage":
         return Finding(
-            "scale-set-by-fixed-lengths",
+            _SET_BY,
             f"{scale_set_by_clause(set_by)}, so the reference lengths had no effect: according to them, the arm is "
             f"{k:.6f} times too large (u = {record.u_k:.2g}).",
             advice="Free one of these lengths, or use the fixed and the reference lengths together (--method joint).",
@@ -120,12 +134,18 @@ def _of_k(record: CalibrationRecord) -> Finding | None:
 
 def _of_lengths(case: Case) -> Finding | None:
     lengths = case.once(lengths_of)
-    if lengths is None or lengths.probability >= LEVEL:
+    named = any(culprit.kind == "certified" for culprit in culprits_of(case))
+    if lengths is None or lengths.probability >= LEVEL or named:
         return None
     kinds = set() if case.record.shared is None else set(case.record.shared.kinds)
     odd = ""
     if lengths.odd:
         odd = f"; {lengths.odd} differs by {lengths.difference:+.3g} mm from the others, which agree with each other"
+    likely = "Look for a wrong length, or for errors outside the D-H model."
+    agree = not culprits_of(case)
+    few = agree and len(lengths.names) <= _FEW
+    if few and not odd:  # each of them may be the wrong one
+        likely = f"The poses agree, so one of these lengths is most likely wrong: {' or '.join(lengths.names)}."
     predicted = "the poses, the stated u and the shared errors" if kinds and not odd else "the poses and the stated u"
     # Errors of places take the part of what u(k) had for lengths that disagree.
     enlarged = case.record.final_method == "two-stage" and PLACES not in kinds
@@ -135,10 +155,12 @@ def _of_lengths(case: Case) -> Finding | None:
         f"{lengths.birge_ratio:.2g} times as large as {predicted} predict (Birge ratio, "
         f"{chance_text(lengths.probability)}){odd}.",
         "u(k) includes this disagreement." if enlarged else "",
-        "Look for a wrong length, or for errors outside the D-H model.",
+        likely,
         severity="doubt",
+        doubt=f"a reference length seems wrong: {lengths.odd or ' or '.join(lengths.names)}" if odd or few else "",
         probability=lengths.probability,
-        concerns=(lengths.odd,) if lengths.odd else (),
+        concerns=(lengths.odd,) if lengths.odd else lengths.names if few else (),
+        explains=1 - 1 / lengths.birge_ratio**2 if agree and (odd or few) else None,  # of the errors of the lengths
     )
 
 
@@ -174,6 +196,9 @@ def lengths_of(case: Case) -> Lengths | None:
     plain = _tested(record, related, covariance, freedom, names)
     if plain is None or plain.odd or record.shared is None or not capture.lengths:
         return plain
+    # Errors of places that so few lengths have taught only say again that these disagree.
+    if plain.number <= _FEW and set(record.shared.kinds) == {PLACES} and not culprits_of(case):
+        return plain
     by_shared = covariance_of_lengths(record.shared, to_numpy(record.calibrated.arm), record.names, capture)
     number = len(by_shared)  # they come before certified values
     by_shared = by_shared / (related.units[:number, None] * related.units[:number])
@@ -195,7 +220,8 @@ def _tested(
 
     worst = int(np.argmax(tested.gains))
     rest = max(square - tested.gains[worst], 0.0)
-    lengths = Lengths(float(np.sqrt(square / number)), number, probability(square, number), len(names))
+    chance = probability(square, number)
+    lengths = Lengths(float(np.sqrt(square / number)), number, chance, len(names), names=tuple(names))
     if number > 1 and probability(rest, number - 1) > _AGREE and _CLEAR * rest < square:
         return lengths._replace(odd=names[worst], difference=float(tested.shifts[worst] * related.units[worst]))
     return lengths

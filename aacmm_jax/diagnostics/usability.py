@@ -14,9 +14,9 @@ from ..data.capture import draw_poses
 from ..kinematics.parameters import Parameters
 from .capture_check import check_capture
 from .contradictions import session_metrics
+from .culprits import missing
 from .equations import EXACT
 from .findings import Case, Finding, findings_of
-from .missing_terms import missing
 from .noisy_encoders import noisiest_joint
 from .pose_residuals import distances_of
 from .reading_check import coupling_words, explanation_words

@@ -9,8 +9,8 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.diagnostics import (
+    causes,
     equations,
-    missing_terms,
     model_errors,
     model_tests,
     noisy_encoders,
@@ -19,7 +19,7 @@ from aacmm_jax.diagnostics import (
 from aacmm_jax.diagnostics.findings import case_of, sentences
 from aacmm_jax.diagnostics.model_errors import rows_of_tests
 
-MODULES = (missing_terms, model_errors, noisy_encoders, scale)
+MODULES = (causes, model_errors, noisy_encoders, scale)
 ARCSEC = aj.units.ARCSEC
 SOCKETS = {"A": (400, 200, 300), "B": (600, 200, 300), "C": (300, -300, 300), "D": (500, 300, 100)}
 NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)

@@ -1,0 +1,470 @@
+"""What is wrong with a calibration, the cause that explains most of its residuals first: forward selection among single
+mistakes and faults.
+
+A cause is either further columns of the linear equations (one pose that is off, a function of readings, a step of a
+zero, of the base or of a seat, a parameter that is fixed, a certified value) or a variance (one encoder, or one socket
+or observation, that is noisier than the others). What a cause would explain is twice the gain of the log likelihood,
+profiled over the level of the noise: -n log(1 - g) of columns that take the part g of the sum of squares, and the
+likelihood ratio of a variance, by the residuals of single poses, each in units of its own standard deviation. That of
+a pose alone is its deletion residual (Cook and Weisberg 1982), so that a bad pose does not count in what it is compared
+with. From this, log n is subtracted for each unknown (Schwarz 1978, Annals of Statistics 6) and twice log m for the
+choice among m causes of a family.
+
+Of those that are significant, the best one joins the model, and the others are compared with what it leaves. Thus a
+cause that only imitates the first one is never named, and nothing is where nothing is significant.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..core.distributions import chi_square_tail, f_tail
+from ..core.units import ARCSEC, DEG
+from .equations import Block, Rows, wider
+from .findings import Case, by_equations, rounded
+from .hypotheses import fixed_text, pose_names, shifted_seats, steps
+from .missing_terms import FoundTerm, columns_of, missing_terms
+from .possible_causes import Cause, of_certified, of_functions, of_parameters, of_variances
+from .residual_tests import LEVEL, Candidates, Residuals, ScoreTest
+
+MOST_CAUSES = 6  # that are looked for one after the other
+_MOST_POSES = 6  # besides these
+_AS_WELL = 6.0  # difference of the criterion below which another cause explains as much
+_LEVEL = LEVEL / 5  # of false alarms of each family besides that of functions
+# Part of the residuals. A step of a joint, 1 mrad, turns the residuals themselves by 1e-3 of their size, and so does
+# the frame of a station that imitates it: in what is left of its column after the frame, linear equations are wrong.
+_SECOND_ORDER = 3e-3
+# Mean square of a pose that is off, over that of the others. Errors that the model lacks reach 49 among the 1,443 poses
+# of `examples/mukca`; less is enough where the pose is also this part of all squares, which such errors are not.
+_FAR, _NEAR, _MUCH = 60.0, 25.0, 0.1
+_MOSTLY = 0.5  # part of a column that certified values and lengths see
+_ONE_JOINT = 0.9  # part of the excess of a pose that a single reading must explain to be named
+_NOTHING = 0.02  # part of all excess, below which a cause is not named
+# Of the gain of the best cause: what a step can lose where its pose is only near that of the change.
+_NEARLY, _MOST_REFINED = 0.5, 4
+_FACTORS = np.geomspace(0.1, 1e4, 32)  # of variances, in units of what they add to the mean square
+_PRESENT = 1e-6  # part of a direction of a pose that the model leaves, below which nothing is left
+
+
+class Culprit(NamedTuple):
+    """A cause that explains residuals."""
+
+    kind: str  # "term", "fixed", "pose", "certified", "noisy joint" or "scatter"
+    name: str  # what it concerns
+    probability: float  # Bonferroni's: of all causes of its family
+    explains: float  # of the excess of the squared residuals
+    term: FoundTerm | None = None
+    says: str = ""  # by how much
+    size: float = 0.0  # ratio of variances, of what is noisier
+    number: int = -1  # of the pose
+    others: tuple[str, ...] = ()  # causes of the same kind that explain as much
+
+
+class Selection(NamedTuple):
+    """The causes of a calibration, the best one first, and the equations with these as further unknowns."""
+
+    culprits: tuple[Culprit, ...]
+    rows: list[Rows]
+    relations: list[Block]
+    remaining: float  # part of the sum of squares that no named cause explains
+
+
+class _Result(NamedTuple):
+    """A cause against the present model."""
+
+    cause: Cause
+    criterion: float  # twice the gain of the log likelihood, less the penalties
+    probability: float  # of all causes of its family
+    share: float  # of the sum of squares
+    test: ScoreTest | None = None
+    factor: float = 0.0  # of a variance
+
+
+class _Studentised(NamedTuple):
+    """The residuals of one part in units of their own standard deviations, pose by pose."""
+
+    values: Float[np.ndarray, "m r"]  # 0 in directions of which the model leaves nothing
+    root: Float[np.ndarray, "m r r"]  # B^(1/2), with the covariance B of a pose's residuals
+    present: Float[np.ndarray, " m"]  # directions of each pose
+
+
+def culprits_of(case: Case) -> tuple[Culprit, ...]:
+    """The causes that explain the residuals of a calibration, the one that explains most first."""
+    return case.once(selection).culprits
+
+
+@by_equations
+def missing(case: Case) -> tuple[FoundTerm, ...]:
+    """The terms that the model of a calibration lacks."""
+    return tuple(culprit.term for culprit in culprits_of(case) if culprit.term is not None and culprit.kind == "term")
+
+
+@by_equations
+def explained(case: Case) -> tuple[list[Rows], list[Block]]:
+    """The equations of a calibration, with all causes as further unknowns, and whitened by the noise that they show."""
+    chosen = case.once(selection)
+    return chosen.rows, chosen.relations
+
+
+@by_equations
+def selection(case: Case) -> Selection:
+    """Forward selection among all causes."""
+    rows, relations = case.chunks
+    if not case.scatters:
+        return Selection((), rows, relations, 1.0)
+    return _Search(case).run()
+
+
+class _Search:
+    """The selection, while it is made."""
+
+    def __init__(self, case: Case):
+        self.case, (self.rows, self.relations) = case, case.chunks
+        self.names = pose_names(case.record.recording.capture)[0]
+        self.causes, parameters = [*of_functions(case), *of_certified(case)], of_parameters(case)
+        self.anchor = [cause for cause in parameters if cause.name == case.equations.anchor]
+        self.parameters = [cause for cause in parameters if cause not in self.anchor] + self.anchor
+        self.noises = of_variances(case, self.rows)
+        self.added: list[Callable[[], Float[np.ndarray, "R c"]]] = []  # columns of the causes that were chosen
+        self.chosen: list[tuple[_Result, list[_Result]]] = []
+        self.sizes: dict[str, int] = {}  # causes of each family
+        self.least = _SECOND_ORDER * float(np.sqrt(case.left.cost))
+        self._begin()
+
+    def _begin(self) -> None:
+        """By the rows as they are weighted now."""
+        self.left = Residuals.of([*(part.block("") for part in self.rows), *self.relations])
+        self.candidates = Candidates.of(self.left, [self._columns(cause) for cause in self.causes])
+        self.fixed = Candidates.of(self.left, [self._columns(cause) for cause in self.parameters])
+        for columns in self.added:
+            self._extend(columns())
+
+    def _extend(self, columns: Float[np.ndarray, "R c"]) -> None:
+        before = self.left.basis.shape[1]
+        self.left = self.left.extended(columns)
+        self.candidates = self.candidates.less(self.left.basis[:, before:])
+        self.fixed = self.fixed.less(self.left.basis[:, before:])
+
+    def _columns(self, cause: Cause) -> Float[np.ndarray, "R _"]:
+        of_relations = sum(len(block.residual) for block in self.relations)
+        if cause.term is not None:
+            (columns,) = columns_of([cause.term], self.rows)
+            return np.pad(columns, ((0, of_relations), (0, 0)))
+        column = np.zeros((len(self.case.left.values), 1))
+        column[len(column) - of_relations + cause.row] = 1.0
+        return column
+
+    def _at_this_scale(self) -> Candidates:
+        """Fixed parameters, less what the scale anchor does: with both free, the arm could shrink, and with it its
+        residuals."""
+        if not self.anchor:
+            return self.fixed
+        whole, anchor = self.fixed.projected, self.fixed.projected[:, -1:]
+        others = whole - anchor @ (anchor.T @ whole) / self._of_anchor()
+        return self.fixed._replace(parts=self.fixed.parts[:-1], projected=others)
+
+    def _of_anchor(self) -> float:
+        """Squared length of what the model leaves of the scale anchor; infinite where that is nothing."""
+        square = float(np.sum(self.fixed.projected[:, -1] ** 2))
+        return square if square > _PRESENT else np.inf
+
+    def _of_pose(self, number: int) -> Float[np.ndarray, "R r"]:
+        """Columns with which a pose agrees whatever its residuals are."""
+        start = 0
+        for part in self.rows:
+            m, r = part.residual.shape
+            (place,) = np.nonzero(part.poses == number)
+            if len(place):
+                columns = np.zeros((len(self.left.values), r))
+                columns[start + r * place[0] + np.arange(r), np.arange(r)] = 1.0
+                return columns
+            start += m * r
+        raise KeyError(number)
+
+    def run(self) -> Selection:
+        remaining = 1.0
+        shares: list[tuple[float, int]] = []  # of what was left, and unknowns
+        freedom = self.left.degrees_of_freedom
+        while len(self.chosen) < MOST_CAUSES + _MOST_POSES:
+            results = self._results()
+            if not results:
+                break
+            best, *others = self._at_their_poses(sorted(results, key=lambda result: -result.criterion))
+            if best.cause.kind != "pose" and sum(r.cause.kind != "pose" for r, _ in self.chosen) >= MOST_CAUSES:
+                break
+            alike = [other for other in others if other.criterion > best.criterion - _AS_WELL]
+            self.chosen.append((best, alike))
+            added = 1 if best.test is None else best.test.degrees_of_freedom[0]
+            shares.append((remaining * best.share, added))
+            remaining *= 1 - best.share
+            self._take(best)
+        excess = [share - added * remaining / max(self.left.degrees_of_freedom, 1) for share, added in shares]
+        whole = max(1 - freedom * remaining / max(self.left.degrees_of_freedom, 1), 1e-12)
+        culprits = self._culprits([min(max(part / whole, 0.0), 1.0) for part in excess])
+        columns = [columns() for columns in self.added]
+        named = float(np.prod([1 - best.share for best, _ in self.chosen if best.cause.kind != "tip"]))
+        return Selection(culprits, *self._with(columns), named)
+
+    def _with(self, columns: list[Float[np.ndarray, "R c"]]) -> tuple[list[Rows], list[Block]]:
+        """The equations with further unknowns."""
+        if not columns:
+            return self.rows, self.relations
+        together, start, rows, relations = np.concatenate(columns, axis=1), 0, [], []
+        for part in self.rows:
+            size = part.residual.size
+            more = together[start : start + size].reshape(*part.residual.shape, -1)
+            rows.append(part._replace(shared=np.concatenate([part.shared, more], axis=2)))
+            start += size
+        for block in wider(self.relations, together.shape[1]):
+            shared = np.array(block.shared)
+            shared[:, -together.shape[1] :] = together[start : start + len(block.residual)]
+            relations.append(block._replace(shared=shared))
+            start += len(block.residual)
+        return rows, relations
+
+    def _take(self, best: _Result) -> None:
+        """Add the best cause to the model."""
+        cause = best.cause
+        if cause.of_noise is None:
+            self.added.append(self._adding(cause))
+            self._extend(self.added[-1]())
+            return
+        along, whitened = cause.of_noise, []
+        for part in self.rows:
+            z = along(part)
+            covariance = np.eye(z.shape[1]) + best.factor * z @ z.swapaxes(1, 2)
+            whitened.append(part.whitened(covariance))
+        self.rows = whitened
+        self._begin()
+
+    def _adding(self, cause: Cause) -> Callable[[], Float[np.ndarray, "R c"]]:
+        """The columns that a cause adds to the model, also where rows are weighted anew."""
+        if cause.kind == "pose":
+            return lambda: self._of_pose(cause.row)
+        if cause.kind != "fixed" or not self.anchor:
+            return lambda: self._columns(cause)
+        number, lengths = self.parameters.index(cause), self.fixed.lengths
+        of_cause, of_anchor = self.fixed.projected[:, number], self.fixed.projected[:, -1]
+        part = float(of_cause @ of_anchor) / self._of_anchor() * lengths[number] / lengths[-1]
+        return lambda: self._columns(cause) - part * self._columns(self.anchor[0])
+
+    def _results(self) -> list[_Result]:
+        """All significant causes."""
+        causes = [*self.causes, *self.parameters[: len(self.parameters) - len(self.anchor)]]
+        tests = [
+            *self.candidates.tests(self.left, self.least),
+            *self._at_this_scale().tests(self.left, self.least),
+        ]
+        number = self.sizes = dict.fromkeys((cause.family for cause in causes), 0)
+        for cause, test in zip(causes, tests, strict=True):
+            number[cause.family] += test.degrees_of_freedom[0] > 0
+        results = []
+        of_relations = self._in_relations()
+        for number_of_cause, (cause, test) in enumerate(zip(causes, tests, strict=True)):
+            if number_of_cause < len(of_relations) and of_relations[number_of_cause]:
+                continue
+            probability = test.probability * number[cause.family]
+            if test.degrees_of_freedom[0] and probability < (LEVEL if cause.family == "function" else _LEVEL):
+                results.append(self._of_columns(cause, test, number[cause.family]))
+        poses = [
+            studentised(part, self.left, rows, private)
+            for part, rows, private in zip(self.rows, self.left.slices, self.left.private, strict=False)
+        ]
+        return [*results, *self._bad_poses(poses), *self._noisy(poses)]
+
+    def _at_their_poses(self, results: Sequence[_Result]) -> list[_Result]:
+        """Causes, the best first, with steps that are nearly as good at the poses where they explain most."""
+        refined: dict[tuple[str, str], _Result] = {}
+        near = results[0].criterion - max(_NEARLY * results[0].share * self.left.degrees_of_freedom, _AS_WELL)
+        for result in results:
+            term = result.cause.term
+            if term is not None and term.first >= 0 and result.criterion > near:
+                refined.setdefault((term.kind, term.concerns), result)
+        steps_there = [self._at_its_pose(result) for result in list(refined.values())[:_MOST_REFINED]]
+        return sorted([*results, *steps_there], key=lambda result: -result.criterion)
+
+    def _at_its_pose(self, best: _Result) -> _Result:
+        """A step at the pose of all near it where it explains most."""
+        term, case = best.cause.term, self.case
+        assert term is not None
+        arm, capture = case.record.calibrated.arm, case.record.recording.capture
+        if best.cause.family == "seat":
+            terms = shifted_seats(capture, term)
+        else:
+            gravity = [t for t in missing_terms(arm, np.asarray(capture.readings)) if t.kind == "gravity"]
+            terms = steps(arm, capture, gravity, term)
+        causes = [best.cause._replace(term=shifted) for shifted in terms]
+        near = Candidates.of(self.left, [self._columns(cause) for cause in causes])
+        tests = near.tests(self.left, self.least)
+        cause, test = max(zip(causes, tests, strict=True), key=lambda pair: pair[1].gain)
+        return self._of_columns(cause, test, self.sizes[cause.family])
+
+    def _of_columns(self, cause: Cause, test: ScoreTest, number: int) -> _Result:
+        share, freedom = test.gain / self.left.cost, self.left.degrees_of_freedom
+        gain = -freedom * float(np.log(max(1 - share, 1e-12)))
+        penalty = test.degrees_of_freedom[0] * np.log(freedom) + 2 * np.log(number)
+        return _Result(cause, gain - float(penalty), min(test.probability * number, 1.0), share, test)
+
+    def _in_relations(self) -> Bool[np.ndarray, " c"]:
+        """Which functions only certified values and lengths see, as a step between two sockets: that these values are
+        wrong is then as good an explanation, and a simpler one."""
+        count = sum(len(block.residual) for block in self.relations)
+        projected, parts = self.candidates.projected, self.candidates.parts
+        rows = len(projected) - count
+        squares = np.array([np.sum(projected[:, part] ** 2) for part in parts])
+        below = np.array([np.sum(projected[rows:, part] ** 2) for part in parts])
+        of_values = np.array([cause.kind == "certified" for cause in self.causes])
+        return (below > _MOSTLY * squares) & ~of_values
+
+    def _bad_poses(self, poses: Sequence[_Studentised]) -> list[_Result]:
+        """The pose that is farthest from what all others say of it."""
+        cost, freedom, worst = self.left.cost, self.left.degrees_of_freedom, None
+        for part, pose in zip(self.rows, poses, strict=True):
+            gains = np.sum(pose.values**2, axis=1)
+            for i in np.argsort(-gains)[:2]:
+                gain, added = float(gains[i]), int(pose.present[i])
+                if not 0 < added < freedom:
+                    continue
+                ratio = gain / added / max((cost - gain) / (freedom - added), 1e-300)
+                far = ratio > _FAR or (ratio > _NEAR and gain > _MUCH * cost)
+                if far and (worst is None or ratio > worst[0]):
+                    worst = ratio, gain, added, int(part.poses[i])
+        if worst is None:
+            return []
+        ratio, gain, added, number = worst
+        probability = f_tail(ratio, added, freedom - added)
+        if probability * len(self.names) >= _LEVEL:
+            return []
+        test = ScoreTest(gain, ratio, (added, freedom - added), probability, np.zeros(added))
+        cause = Cause("pose", "pose", self.names[number], row=number)
+        return [self._of_columns(cause, test, len(self.names))]
+
+    def _noisy(self, poses: Sequence[_Studentised]) -> list[_Result]:
+        """Encoders and observations that are noisier than the others."""
+        u = np.concatenate([pose.values.ravel() for pose in poses])
+        cost, count = float(u @ u), float(sum(pose.present.sum() for pose in poses))
+        freedom, results = self.left.degrees_of_freedom, []
+        for cause in self.noises:
+            along = cause.of_noise
+            assert along is not None
+            sizes, squares = [], []
+            for part, pose in zip(self.rows, poses, strict=True):
+                z = pose.root @ along(part)
+                values, vectors = np.linalg.eigh(z @ z.swapaxes(1, 2))
+                sizes.append(values.ravel())
+                squares.append((np.einsum("mab,ma->mb", vectors, pose.values) ** 2).ravel())
+            size, square = np.concatenate(sizes), np.concatenate(squares)
+            size, square = size[size > 1e-9 * size.max(initial=0.0)], square[size > 1e-9 * size.max(initial=0.0)]
+            if not len(size):
+                continue
+            factors = _FACTORS[:, None] / np.mean(size)
+            left = cost - np.sum(factors * size * square / (1 + factors * size), axis=1)
+            twice = count * np.log(cost / left) - np.sum(np.log1p(factors * size), axis=1)
+            best = int(np.argmax(twice))
+            gain = float(twice[best]) * freedom / count
+            probability = 0.5 * chi_square_tail(max(gain, 0.0), 1) * len(self.noises)
+            if probability < _LEVEL:
+                share, penalty = 1 - np.exp(-gain / freedom), np.log(freedom) + 2 * np.log(len(self.noises))
+                factor = float(factors[best, 0])
+                results.append(_Result(cause, gain - float(penalty), probability, float(share), None, factor))
+        return results
+
+    def _culprits(self, explains: Sequence[float]) -> tuple[Culprit, ...]:
+        """In words."""
+        terms = [result for result, _ in self.chosen if result.cause.term is not None]
+        coefficients: dict[int, np.ndarray] = {}
+        if terms:
+            # All together, by the equations as they were weighted last, with the other causes.
+            rest = Residuals.of([*(part.block("") for part in self.rows), *self.relations])
+            mean, each = [result for result, _ in self.chosen if result.cause.of_noise is None], []
+            for result, adding in zip(mean, self.added, strict=True):
+                if result.cause.term is None:
+                    rest = rest.extended(adding())
+                else:
+                    each.append(adding())
+            (together,) = Candidates.of(rest, [np.concatenate(each, axis=1)]).tests(rest, self.least)
+            parts = np.split(together.coefficients, np.cumsum([columns.shape[1] for columns in each])[:-1])
+            coefficients = {id(result): part for result, part in zip(terms, parts, strict=True)}
+        culprits = []
+        for (result, alike), part in zip(self.chosen, explains, strict=True):
+            cause = result.cause
+            if cause.kind == "tip":  # the seat, whose noise no class of arms states exactly
+                continue
+            if culprits and part < _NOTHING:
+                continue
+            culprit = Culprit(cause.kind, cause.name, result.probability, part)
+            culprits.append(self._in_words(culprit, result, alike, coefficients.get(id(result), np.zeros(0))))
+        return tuple(culprits)
+
+    def _in_words(
+        self, culprit: Culprit, result: _Result, alike: Sequence[_Result], coefficient: np.ndarray
+    ) -> Culprit:
+        cause = result.cause
+        if cause.kind == "pose":
+            return culprit._replace(says=self._pose_text(cause.row), number=cause.row)
+        if cause.of_noise is not None:
+            return culprit._replace(size=1 + result.factor)
+        if cause.kind == "certified":
+            names = tuple(dict.fromkeys(r.cause.name for r in alike if r.cause.kind == cause.kind))
+            return culprit._replace(others=tuple(name for name in names if name != cause.name))
+        if cause.term is None or result.test is None:
+            return culprit
+        term = cause.term
+        if cause.kind == "fixed":
+            return culprit._replace(says=fixed_text(term, float(coefficient[0])))
+        values = (term.values @ coefficient).reshape(len(term.values), -1)
+        size = abs(coefficient[0]) if term.relative else np.linalg.norm(np.ptp(values, axis=0)) / 2
+        amplitude = float(size) * (1.0 if term.joint is None else 1e-3)
+        # The same step at a neighbouring pose is no other cause.
+        others = [r.cause.term for r in alike if r.cause.term is not None]
+        others = [o for o in others if (o.kind, o.concerns) != (term.kind, term.concerns) or o.kind == "coupling"]
+        distinct = {(o.kind, o.concerns, o.correction): o for o in reversed(others)}
+        probability = result.probability
+        found = FoundTerm(term.kind, term.joint, result.test, probability, amplitude, tuple(distinct.values()), term)
+        return culprit._replace(term=found)
+
+    def _pose_text(self, number: int) -> str:
+        """How far a pose is off, and what a single reading would have to be off by to explain that."""
+        joints = self.case.record.calibrated.arm.joints
+        left = self.case.left
+        for part, rows, private in zip(self.case.chunks[0], left.slices, left.private, strict=False):
+            (place,) = np.nonzero(part.poses == number)
+            if not len(place):
+                continue
+            i = int(place[0])
+            pose = studentised(part, left, rows, private)
+            r, block = left.values[rows].reshape(part.residual.shape)[i], pose.root[i] @ pose.root[i].T
+            # The residual that the pose would have if it were left out.
+            away = float(np.linalg.norm(part.in_mm[i] @ np.linalg.pinv(block) @ r))
+            z = part.extra[i, :, :joints]
+            seen = np.maximum(np.einsum("rj,rs,sj->j", z, block, z), 1e-300)
+            gains = (r @ z) ** 2 / seen
+            worst = int(np.argmax(gains))
+            text = f"{rounded(away)} mm off"
+            explaining = gains > _ONE_JOINT * float(np.sum(pose.values[i] ** 2))
+            if explaining.sum() == 1 and away > 0:
+                slides = worst + 1 in self.case.record.calibrated.arm.prismatic
+                error = abs(float((r @ z)[worst] / seen[worst])) * (1.0 if slides else 1e-3)
+                size = f"{rounded(error)} mm" if slides else _angle(error)
+                text += f", as if the reading of joint {worst + 1} were wrong by {size}"
+            return text
+        return ""
+
+
+def _angle(error: float) -> str:
+    return f"{rounded(error / DEG)} deg" if error > 0.1 * DEG else f"{rounded(error / ARCSEC)} arcsec"
+
+
+def studentised(part: Rows, left: Residuals, rows: slice, private: Float[np.ndarray, "R k"]) -> _Studentised:
+    """The residuals of the poses of one part, each in units of its own standard deviations."""
+    columns = np.concatenate([private, left.basis[rows]], axis=1).reshape(*part.residual.shape, -1)
+    block = np.eye(columns.shape[1]) - columns @ columns.swapaxes(1, 2)
+    values, vectors = np.linalg.eigh(block)
+    present = values > _PRESENT
+    roots = np.sqrt(np.where(present, values, 0.0))
+    along = np.einsum("mab,ma->mb", vectors, left.values[rows].reshape(part.residual.shape))
+    along = np.where(present, along / np.where(present, roots, 1.0), 0.0)
+    root = (vectors * roots[:, None, :]) @ vectors.swapaxes(1, 2)
+    return _Studentised(np.einsum("mab,mb->ma", vectors, along), root, present.sum(axis=1))

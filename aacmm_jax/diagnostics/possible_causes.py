@@ -1,0 +1,92 @@
+"""All causes among which `culprits` selects: functions and steps, fixed parameters, certified values, and variances."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..model.observed import Observed
+from .equations import PRIOR, Rows, lengths_in_solve
+from .findings import Case
+from .hypotheses import couplings, fixed_parameters, shifted_seats, steps
+from .missing_terms import MissingTerm, missing_terms
+
+_FEWEST = 6  # poses of a socket or observation whose scatter is compared with that of the others
+_MOST_GROUPS = 60
+
+
+class Cause(NamedTuple):
+    """What may be wrong: columns of a term, a pose or a certified value, or a variance."""
+
+    kind: str
+    family: str
+    name: str
+    term: MissingTerm | None = None
+    row: int = -1  # of the relations
+    of_noise: Callable[[Rows], np.ndarray] | None = None  # (m, r, c): errors that scatter along these
+
+
+def of_functions(case: Case) -> list[Cause]:
+    """Causes that are functions of the readings, and of the order of the poses."""
+    arm, capture = case.record.calibrated.arm, case.record.recording.capture
+    q = np.asarray(capture.readings)
+    functions = missing_terms(arm, q)
+    gravity = [term for term in functions if term.kind == "gravity"]
+    families = {
+        "function": functions,
+        "step": steps(arm, capture, gravity),
+        "seat": shifted_seats(capture),
+        "coupling": couplings(arm, q),
+    }
+    return [Cause("term", family, term.concerns, term) for family, terms in families.items() for term in terms]
+
+
+def of_parameters(case: Case) -> list[Cause]:
+    """Parameters that are no unknowns: those that are fixed, and the scale anchor."""
+    free = [name for name in case.record.names if name != case.equations.anchor]
+    joints, poses = case.record.calibrated.arm.joints, len(np.asarray(case.record.recording.capture.readings))
+    if len(case.record.scale_set_by) == 1:  # without it the arm could shrink
+        free += case.record.scale_set_by
+    terms = fixed_parameters(case.equations.extra, free, joints, poses)
+    return [Cause("fixed", "fixed", term.concerns, term) for term in terms]
+
+
+def of_certified(case: Case) -> list[Cause]:
+    """Certified values, and lengths that took part in the least squares."""
+    capture = case.record.recording.capture
+    lengths = capture.lengths if lengths_in_solve(case.record) else ()
+    names = [f"{length.start} - {length.end}" for length in lengths]
+    points = {f"coordinates of {getattr(o, 'artefact', '')}": getattr(o, "names", ()) for o in capture.observations}
+    for part, (value, _) in Observed.of(capture, None).certified().items():
+        labels, size = points.get(part, ()), np.asarray(value).size
+        whole = [part.partition(" of ")[2] or part] * size
+        names += [label for label in labels for _ in range(3)] if 3 * len(labels) == size else whole
+    total = sum(len(block.residual) for block in case.chunks[1] if block.fixture != PRIOR)
+    if len(names) != total:
+        return []
+    return [Cause("certified", "certified", name, row=row) for row, name in enumerate(names)]
+
+
+def of_variances(case: Case, rows: Sequence[Rows]) -> list[Cause]:
+    """One encoder, or one socket or observation, that is noisier; and the seat, beside the encoders."""
+
+    def of_joint(joint: int) -> Callable[[Rows], np.ndarray]:
+        return lambda part: part.extra[..., [joint]]
+
+    def of_group(name: str) -> Callable[[Rows], np.ndarray]:
+        return lambda part: np.broadcast_to(
+            np.eye(part.residual.shape[1]) * (part.name == name), (*part.residual.shape, part.residual.shape[1])
+        )
+
+    if not case.shows_noise:
+        return []
+    joints = case.record.calibrated.arm.joints
+    causes = [Cause("noisy joint", "noise", f"joint {j + 1}", of_noise=of_joint(j)) for j in range(joints)]
+    causes.append(Cause("tip", "noise", "tip", of_noise=lambda part: part.by_tip))
+    poses: dict[str, int] = {}
+    for part in rows:
+        poses[part.name] = poses.get(part.name, 0) + len(part.poses)
+    groups = [name for name, count in poses.items() if count >= _FEWEST]
+    if 1 < len(groups) <= _MOST_GROUPS:
+        causes += [Cause("scatter", "noise", name, of_noise=of_group(name)) for name in groups]
+    return causes
