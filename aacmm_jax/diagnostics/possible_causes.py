@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from ..model.observed import Observed
 from .equations import PRIOR, Rows, lengths_in_solve
@@ -13,6 +14,8 @@ from .missing_terms import MissingTerm, missing_terms
 
 _FEWEST = 6  # poses of a socket or observation whose scatter is compared with that of the others
 _MOST_GROUPS = 60
+_APART = 0.01  # part of a fixed parameter's effect that no free one has, below which it is redundant
+_SMALL = 1e-9  # singular value, relative to the largest
 
 
 class Cause(NamedTuple):
@@ -48,7 +51,25 @@ def of_parameters(case: Case) -> list[Cause]:
     if len(case.record.scale_set_by) == 1:  # without it the arm could shrink
         free += case.record.scale_set_by
     terms = fixed_parameters(case.equations.extra, free, joints, poses)
-    return [Cause("fixed", "fixed", term.concerns, term) for term in terms]
+    apart = _apart_from_free(case.equations.rows)
+    return [Cause("fixed", "fixed", term.concerns, term) for term in terms if apart[term.column] > _APART]
+
+
+def _apart_from_free(rows: Sequence[Rows]) -> Float[np.ndarray, " e"]:
+    """Part of the effect of each of `Rows.extra` on the poses that free parameters and geometry cannot have, 0 to 1.
+
+    A fixed parameter without such a part is redundant: what speaks for another value of it is the prior of the others.
+    """
+    stacked = []
+    for part in rows:
+        flat = [columns.reshape(part.residual.size, -1) for columns in (part.private, part.shared, part.extra)]
+        basis = np.linalg.qr(flat[0])[0]
+        stacked.append([columns - basis @ (basis.T @ columns) for columns in flat[1:]])
+    shared, extra = (np.concatenate(columns) for columns in zip(*stacked, strict=True))
+    basis, sizes, _ = np.linalg.svd(shared, full_matrices=False)
+    basis = basis[:, sizes > _SMALL * sizes.max(initial=1e-300)]
+    left = np.linalg.norm(extra - basis @ (basis.T @ extra), axis=0)
+    return left / np.maximum(np.linalg.norm(extra, axis=0), 1e-300)
 
 
 def of_certified(case: Case) -> list[Cause]:

@@ -20,6 +20,8 @@ OTHERS = {
     "acceptance/judgement.py": 4,  # the probability of conformity of ISO 14253-1:2017
     "cli/plan_commands.py": 1,  # part of the reach
     "cli/result_commands.py": 1,  # ISO 14253-1:2017
+    "drift/statistics.py": 3,  # power of the test of a change
+    "study/finding.py": 1,  # percentile of a study
     "diagnostics/joint_travel.py": 2,  # of poses that are as near to another one
     "diagnostics/recorded.py": 1,  # least improvement by another reading of a file
     "drift/results.py": 1,  # a number that rounds to 1

@@ -44,7 +44,7 @@ def capture(paper_arm) -> aj.Capture:
 
 @pytest.fixture(scope="module")
 def result(paper_arm, capture, bounds) -> aj.Calibration:
-    return aj.calibrate(paper_arm, capture, bounds, method="joint", noise=NOISE)
+    return aj.calibrate(paper_arm, capture, bounds, method="joint", noise=NOISE, shared_errors=False)
 
 
 def test_small_inverse_roots_are_those_of_cholesky():
