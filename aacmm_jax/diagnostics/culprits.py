@@ -27,7 +27,7 @@ from .findings import Case, by_equations, rounded
 from .hypotheses import fixed_text, pose_names, shifted_seats, steps
 from .missing_terms import FoundTerm, columns_of, missing_terms
 from .possible_causes import Cause, of_certified, of_functions, of_parameters, of_variances
-from .residual_tests import LEVEL, Candidates, Residuals, ScoreTest
+from .residual_tests import LEVEL, PRESENT, Candidates, Residuals, ScoreTest, Studentised, studentised
 
 MOST_CAUSES = 6  # that are looked for one after the other
 _MOST_POSES = 6  # besides these
@@ -45,7 +45,6 @@ _NOTHING = 0.02  # part of all excess, below which a cause is not named
 # Of the gain of the best cause: what a step can lose where its pose is only near that of the change.
 _NEARLY, _MOST_REFINED = 0.5, 4
 _FACTORS = np.geomspace(0.1, 1e4, 32)  # of variances, in units of what they add to the mean square
-_PRESENT = 1e-6  # part of a direction of a pose that the model leaves, below which nothing is left
 
 
 class Culprit(NamedTuple):
@@ -80,14 +79,6 @@ class _Result(NamedTuple):
     share: float  # of the sum of squares
     test: ScoreTest | None = None
     factor: float = 0.0  # of a variance
-
-
-class _Studentised(NamedTuple):
-    """The residuals of one part in units of their own standard deviations, pose by pose."""
-
-    values: Float[np.ndarray, "m r"]  # 0 in directions of which the model leaves nothing
-    root: Float[np.ndarray, "m r r"]  # B^(1/2), with the covariance B of a pose's residuals
-    present: Float[np.ndarray, " m"]  # directions of each pose
 
 
 def culprits_of(case: Case) -> tuple[Culprit, ...]:
@@ -168,7 +159,7 @@ class _Search:
     def _of_anchor(self) -> float:
         """Squared length of what the model leaves of the scale anchor; infinite where that is nothing."""
         square = float(np.sum(self.fixed.projected[:, -1] ** 2))
-        return square if square > _PRESENT else np.inf
+        return square if square > PRESENT else np.inf
 
     def _of_pose(self, number: int) -> Float[np.ndarray, "R r"]:
         """Columns with which a pose agrees whatever its residuals are."""
@@ -318,7 +309,7 @@ class _Search:
         of_values = np.array([cause.kind == "certified" for cause in self.causes])
         return (below > _MOSTLY * squares) & ~of_values
 
-    def _bad_poses(self, poses: Sequence[_Studentised]) -> list[_Result]:
+    def _bad_poses(self, poses: Sequence[Studentised]) -> list[_Result]:
         """The pose that is farthest from what all others say of it."""
         cost, freedom, worst = self.left.cost, self.left.degrees_of_freedom, None
         for part, pose in zip(self.rows, poses, strict=True):
@@ -341,7 +332,7 @@ class _Search:
         cause = Cause("pose", "pose", self.names[number], row=number)
         return [self._of_columns(cause, test, len(self.names))]
 
-    def _noisy(self, poses: Sequence[_Studentised]) -> list[_Result]:
+    def _noisy(self, poses: Sequence[Studentised]) -> list[_Result]:
         """Encoders and observations that are noisier than the others."""
         u = np.concatenate([pose.values.ravel() for pose in poses])
         cost, count = float(u @ u), float(sum(pose.present.sum() for pose in poses))
@@ -455,16 +446,3 @@ class _Search:
 
 def _angle(error: float) -> str:
     return f"{rounded(error / DEG)} deg" if error > 0.1 * DEG else f"{rounded(error / ARCSEC)} arcsec"
-
-
-def studentised(part: Rows, left: Residuals, rows: slice, private: Float[np.ndarray, "R k"]) -> _Studentised:
-    """The residuals of the poses of one part, each in units of its own standard deviations."""
-    columns = np.concatenate([private, left.basis[rows]], axis=1).reshape(*part.residual.shape, -1)
-    block = np.eye(columns.shape[1]) - columns @ columns.swapaxes(1, 2)
-    values, vectors = np.linalg.eigh(block)
-    present = values > _PRESENT
-    roots = np.sqrt(np.where(present, values, 0.0))
-    along = np.einsum("mab,ma->mb", vectors, left.values[rows].reshape(part.residual.shape))
-    along = np.where(present, along / np.where(present, roots, 1.0), 0.0)
-    root = (vectors * roots[:, None, :]) @ vectors.swapaxes(1, 2)
-    return _Studentised(np.einsum("mab,mb->ma", vectors, along), root, present.sum(axis=1))

@@ -17,11 +17,12 @@ from jaxtyping import Float
 
 from ..core.distributions import chi_square_tail, f_tail
 from ..core.linear_algebra import inverse_cholesky
-from .equations import Block
+from .equations import Block, Rows
 
 LEVEL = 0.01  # of false alarms of one family of tests
 _NULL = 1e-5  # singular values of scaled columns below this, of the largest, are zero
 _MANY = 60  # columns, from which singular values are avoided where possible
+PRESENT = 1e-6  # part of a direction of a pose that the model leaves, below which nothing is left
 _EXPLAINED = 1e-8  # squared part of a column that the model leaves, below which it counts as the model's own
 
 
@@ -290,3 +291,24 @@ def _tail(value: float, traces: tuple[float, float, float]) -> float:
     argument = freedom + np.sign(t3) * (value - t1) * np.sqrt(freedom / t2)
     upper = chi_square_tail(max(float(argument), 0.0), freedom)
     return upper if t3 > 0 else 1 - upper
+
+
+class Studentised(NamedTuple):
+    """The residuals of one part in units of their own standard deviations, pose by pose."""
+
+    values: Float[np.ndarray, "m r"]  # 0 in directions of which the model leaves nothing
+    root: Float[np.ndarray, "m r r"]  # B^(1/2), with the covariance B of a pose's residuals
+    present: Float[np.ndarray, " m"]  # directions of each pose
+
+
+def studentised(part: Rows, left: Residuals, rows: slice, private: Float[np.ndarray, "R k"]) -> Studentised:
+    """The residuals of the poses of one part, each in units of its own standard deviations."""
+    columns = np.concatenate([private, left.basis[rows]], axis=1).reshape(*part.residual.shape, -1)
+    block = np.eye(columns.shape[1]) - columns @ columns.swapaxes(1, 2)
+    values, vectors = np.linalg.eigh(block)
+    present = values > PRESENT
+    roots = np.sqrt(np.where(present, values, 0.0))
+    along = np.einsum("mab,ma->mb", vectors, left.values[rows].reshape(part.residual.shape))
+    along = np.where(present, along / np.where(present, roots, 1.0), 0.0)
+    root = (vectors * roots[:, None, :]) @ vectors.swapaxes(1, 2)
+    return Studentised(np.einsum("mab,mb->ma", vectors, along), root, present.sum(axis=1))

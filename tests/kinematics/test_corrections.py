@@ -7,7 +7,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.calibration.redrawn import truth_of
 from aacmm_jax.core.numpy_or_jax import to_numpy
-from aacmm_jax.diagnostics.missing_terms import FoundTerm, wider_model
+from aacmm_jax.diagnostics.missing_terms import FoundTerm, MissingTerm, wider_model
 from aacmm_jax.kinematics import parameter_names, with_corrections
 from aacmm_jax.kinematics.arm import correction_names
 from aacmm_jax.kinematics.chain import KnownFunctions, forward_pass, joint_motion, joints_first
@@ -344,5 +344,6 @@ def test_functions_together_are_those_one_by_one():
 )
 def test_a_model_that_the_arm_has_is_not_advised(model, found, advised):
     arm = with_corrections(aj.load_arm("panda"), model)
-    terms = tuple(FoundTerm(kind, 2, *[None] * (len(FoundTerm._fields) - 2)) for kind in found)
+    term = MissingTerm("", 2, np.ones((1, 1)))
+    terms = tuple(FoundTerm(kind, 2, *[None] * (len(FoundTerm._fields) - 3), term) for kind in found)
     assert set(wider_model(terms, arm).split(",")) == set(advised.split(","))
