@@ -59,6 +59,6 @@ def test_intervals_from_few_placements_hold(placements, most):
     trials = degrees_of_freedom.placed(placements)
     found = degrees_of_freedom.covered(trials, 0.01, range(64))
     assert found.inside > 0.88
-    assert found.over_oracle < most
+    assert np.median(found.over_oracle) < most
     # What made it necessary: the normal factor covers less.
     assert np.mean(np.abs(found.errors) <= 1.96 * found.u) < found.inside

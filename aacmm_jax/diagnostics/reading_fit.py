@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from ..core.numpy_or_jax import to_numpy
 from ..core.rotations import fitted_frame, rotation_matrix
@@ -190,6 +189,8 @@ class ReadingFit:
         residual = (tips - evidence.points).ravel()
         if evidence.rotations is None:
             return residual, flat
+        from scipy.spatial.transform import Rotation  # takes long to import
+
         frames = np.stack(forward.frame, axis=1).T.swapaxes(1, 2)
         turned = Rotation.from_matrix(frames @ evidence.rotations.swapaxes(1, 2)).as_rotvec().ravel()
         by_angles = np.moveaxis(np.asarray(rotation_columns(forward, self._indices)), -1, 0).swapaxes(1, 2)

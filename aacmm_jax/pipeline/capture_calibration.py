@@ -129,7 +129,8 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
     automatic, decided = chosen.automatic and chosen.scale == "measured", ()
     if automatic:
         recording, chosen, decided = with_prior_of_few(recording, chosen)
-    stated = (chosen.model, chosen.robust, chosen.method, recording.nominal.prior, nominal.arm.corrections)
+    anchor = None if chosen.hold == _SOLVE.hold else (chosen.hold,)  # two stages, which no other model would have
+    stated = (chosen.model, chosen.robust, chosen.method, anchor, recording.nominal.prior, nominal.arm.corrections)
 
     def recorded(result: Calibration | Identification, part: Recording) -> CalibrationRecord:
         record = record_of(result, part, robust=chosen.robust)
@@ -149,7 +150,7 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
             record, explanation = chosen.stage("Checking readings", check)
             capture = capture if explanation is None else corrected_capture(capture, explanation) or capture
             record = chosen.stage("Checking bounds", lambda: with_wider_bounds(record, solved, recorded))
-        if automatic or chosen.remove_contradicting:
+        if chosen.remove_contradicting or (automatic and chosen.robust is None):  # which bad poses do not move
             record = chosen.stage("Comparing groups", lambda: without_contradicting(record, solved, recorded))
         if automatic and all(value is None for value in stated):
             record = with_best_model(record, recorded, chosen)

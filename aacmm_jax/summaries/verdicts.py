@@ -19,6 +19,7 @@ _LARGER = 1.25  # times what is predicted: less is as good as predicted
 # A prediction so many times what was found is of no use, and what is found so many times the prediction refutes it,
 # whatever the number of degrees of freedom. A single length is so near its value by chance in 8 of 100 cases.
 _FAR, _FEWEST_LENGTHS = 10.0, 2
+_NOTABLE = 1.2  # errors over their prediction, up to which a difference that many poses show does not matter
 _WORSE = 2.0  # times the errors of lengths by the nominal arm: the calibration made them worse
 
 
@@ -172,7 +173,8 @@ def _as_predicted(held_out: Mapping[str, Any]) -> Verdict:
     chances = [row.get("probability") for row in (poses, *([of_lengths] if beyond else []))]
     chances = [chance for chance in chances if chance is not None]
     larger = max(measured / expected if expected else 0.0, ratio if ratio and beyond else 0.0)
-    if larger > _FAR or any(chance < SIGNIFICANCE / len(chances) for chance in chances):
+    by_more_than_chance = any(chance < SIGNIFICANCE / len(chances) for chance in chances)
+    if larger > _FAR or (by_more_than_chance and larger > _NOTABLE):
         by_chance = f" (p = {min(chances):.1g})" if chances else ""
         return Verdict("unsure", f"Errors on held-out data exceed the prediction{by_chance}: {rms}.", False)
     few = of_lengths.get("lengths", 0) < _FEWEST_LENGTHS

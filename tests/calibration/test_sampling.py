@@ -150,8 +150,8 @@ def test_cross_validation_shows_what_the_uncertainty_misses(arm, bounds, capture
     held_out = next(sentence for sentence in found if sentence.startswith(larger))
     assert f"{checked.rms / checked.rms_predicted:.1f} times the predicted {checked.rms_predicted:.3g} mm;" in held_out
     assert f"{checked.length_rms / checked.length_u:.1f} times the predicted {checked.length_u:.3g} mm" in held_out
-    assert "Use the cross-validated values" in held_out
-    assert any("Reference lengths disagree with the arm: the errors of the 3 lengths" in sentence for sentence in found)
+    assert "Measure the reference lengths again" in held_out
+    assert found[0].startswith("A certified value differs from what the poses and the other values say")
 
 
 def left_out(rms, errors, u, poses=24, predicted=0.01) -> LeftOut:
