@@ -181,7 +181,7 @@ def _places(measured: Measured, by_bar: bool) -> str | None:
 
 
 # Requirements by kind: what they say; the sentence on what is lacking; and what puts that into words (None where
-# nothing is lacking, "" where the sentence has no room for words), or counts what the last number is the least of. In
+# nothing is lacking, "" where the sentence takes no words), or counts what the last number is the least of. In
 # both texts, {0} is what is lacking, {1} and so on the numbers that a test gives.
 _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
     "size": (

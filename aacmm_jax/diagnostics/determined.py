@@ -1,4 +1,4 @@
-"""What the data of a calibration determine, and what nothing checks: parameters that are on a bound or hardly known,
+"""What the data of a calibration determine, and what nothing checks: parameters on a bound or poorly determined,
 few equations, and a single reference length."""
 
 from collections.abc import Iterator
@@ -16,10 +16,10 @@ from .usability import is_anchored, many_on_bounds, on_bounds
 
 ORDER, NEEDS = 85, "fit"
 _TOGETHER = 1e-3  # part of an undetermined direction, from which a parameter belongs to it
-# Of those that the data hardly determine apart from others, and of the others, which wider bounds help.
+# Of those that the data do not tell from others well, and of the others, which wider bounds help.
 _ON_BOUNDS = {
     "weak-on-bounds": (
-        "On a bound because the data hardly determine these parameters: {names}.",
+        "On a bound because the data determine these parameters poorly: {names}.",
         "The uncertainties of these parameters depend on the width of the bounds.",
         "Fix one parameter of each combination named below (--held), and do not widen the bounds.",
     ),
@@ -44,7 +44,7 @@ def determined(case: Case) -> Observability:
 
 
 def test(case: Case) -> list[Finding]:
-    """Parameters on bounds, little redundancy, undetermined combinations, and parameters that are hardly known."""
+    """Parameters on bounds, little redundancy, undetermined combinations, and parameters that are poorly determined."""
     record, seen = case.record, case.once(determined)
     traded = {name for trade_off in seen.trade_offs for name in trade_off.names}
     # Without an anchor all lengths slide to bounds in stage 1, which the scale fix undoes.
@@ -67,8 +67,8 @@ def test(case: Case) -> list[Finding]:
     if names:
         findings.append(
             Finding(
-                "hardly-determined",
-                f"Hardly determined individually: {shorten(names, 12)}. These parameters are strongly correlated, or "
+                "poorly-determined",
+                f"Poorly determined individually: {shorten(names, 12)}. These parameters are strongly correlated, or "
                 "their standard uncertainty exceeds a quarter of the distance between their bounds.",
                 "Tip and length uncertainties remain valid.",
                 "Fix some of these parameters (--held), or record poses that separate them.",

@@ -91,7 +91,7 @@ def standing_rows(arm: Arm, capture: Capture, nominal: ArmSpecification | None =
     rows = []
     for (joint, travel, poses), names in zip(still, lost_by_standing(arm, capture, joints), strict=True):
         unit, size = ("mm", travel) if joint in arm.prismatic else ("deg", travel / DEG)
-        says = f"Joint {joint} hardly moves ({size:.2g} {unit} over {pluralise(poses, 'pose')})"
+        says = f"Joint {joint} moves too little ({size:.2g} {unit} over {pluralise(poses, 'pose')})"
         if names:
             says += f": {listed(names)} cannot be identified; {remedy}."
         else:
@@ -138,7 +138,7 @@ def lost_by_standing(
     of_joints = {f"{kind}_{joint}" for kind in ("alpha", "a", "d", "theta", "beta") for joint in joints}
     order = sorted(names, key=of_joints.__contains__)  # the last are lost first
     neighbour = neighbouring_arm(base, tuple(order))  # without the exact alignments of the nominal arm
-    # A target's place is unknown, and hardly on the last axis.
+    # A target's place is unknown, and seldom on the last axis.
     if any(observation.target for observation in capture.observations):
         neighbour = with_arrays(neighbour, probe=np.asarray(neighbour.probe) + _TARGET)
     low, high = np.asarray(joint_limits(arm, None)).T

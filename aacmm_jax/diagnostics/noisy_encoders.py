@@ -243,8 +243,8 @@ def _noisiest(record: CalibrationRecord, equations: _Equations) -> tuple[NoisyJo
     noisiest = equations.noisiest(joints)
     if noisiest is None or noisiest.probability >= LEVEL or record.given_noise is not None:
         return noisiest, equations
-    # The noise of the calibration comes from two moments; its seat is often 0, and then poses that hardly see the
-    # encoders in some direction count too much there.
+    # The noise of the calibration comes from two moments; its seat is often 0, and then poses whose tip encoders move
+    # little in some direction count too much there.
     equations, _ = equations.estimated([joints, [len(joints)]])
     return equations.noisiest(joints), equations
 
@@ -293,7 +293,9 @@ def noise_by_joint(case: Case) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
     )
     try:
         noise.check(joints)
-    except InputError:  # more than any encoder has: poses that hardly see the joint do not determine its noise
+    except (
+        InputError
+    ):  # more than any encoder has: poses in which the joint moves the tip little do not determine its noise
         return None
     encoders = []
     for test, i, u_log in zip(noisy, index, u, strict=False):

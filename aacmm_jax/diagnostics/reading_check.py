@@ -247,7 +247,7 @@ def _others(
 
 
 def _distinct(first: Explanation, other: Explanation, apart: float = _APART) -> bool:
-    """Whether two explanations differ by more than zeros that are hardly determined."""
+    """Whether two explanations differ by more than zeros that are poorly determined."""
     if first[:2] != other[:2] or first[3:5] != other[3:5]:
         return True
     pairs = zip(first.offsets, other.offsets, strict=True)

@@ -121,7 +121,7 @@ def _determined_row(data: str, seen: Observability) -> dict[str, Any]:
         "scale": not any("the scale" in text for text in seen.undetermined),
         "undetermined": list(seen.undetermined),
         "corrections": list(seen.corrections),
-        "hardly_determined": [trade_off.text for trade_off in seen.trade_offs],
+        "poorly_determined": [trade_off.text for trade_off in seen.trade_offs],
     }
 
 

@@ -19,7 +19,9 @@ _LARGER = 1.25  # times what is predicted: less is as good as predicted
 # A prediction so many times what was found is of no use, and what is found so many times the prediction refutes it,
 # whatever the number of degrees of freedom. A single length is so near its value by chance in 8 of 100 cases.
 _FAR, _FEWEST_LENGTHS = 10.0, 2
-_NOTABLE = 1.2  # errors over their prediction, up to which a difference that many poses show does not matter
+# Errors over their prediction, up to which a difference that many poses show does not matter: a variance that is off
+# by a quarter.
+_NOTABLE = 1.25**0.5
 _WORSE = 2.0  # times the errors of lengths by the nominal arm: the calibration made them worse
 
 

@@ -95,7 +95,7 @@ class Observability(NamedTuple):
         }
 
     def sentences(self) -> list[str]:
-        """What a user should know, one sentence each: directions that are not or hardly determined, and what to do."""
+        """What a user should know, one sentence each: directions that are not or poorly determined, and what to do."""
         sentences = []
         pairs = list(zip(self.undetermined, self.structural, strict=True))
         always, now = ([text for text, never in pairs if never == wanted] for wanted in (True, False))
@@ -115,7 +115,7 @@ class Observability(NamedTuple):
             texts = _first([trade_off.text for trade_off in self.trade_offs])
             first = ", ".join(trade_off.names[0] for trade_off in self.trade_offs)
             sentences.append(
-                f"Hardly determined by these data: {texts}. Fix one parameter of each combination, such as {first} "
+                f"Poorly determined by these data: {texts}. Fix one parameter of each combination, such as {first} "
                 "(--held); wider bounds do not help."
             )
         sentences += self.corrections

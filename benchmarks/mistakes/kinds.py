@@ -307,7 +307,7 @@ _GROUP = (r"\b{group} [^.]*(moved|shift|contradict|scatter)", r"^[a-z-]+:.*\[{gr
 _DRIFT = r"drift of joint {joint}|zero of joint {joint}|^joint-drift.*joint {joint}"
 _UNDETERMINED = (
     r"close together|small part of",
-    r"^(standing-joints|undetermined|hardly-determined|little-redundancy|weak-on-bounds)",
+    r"^(standing-joints|undetermined|poorly-determined|little-redundancy|weak-on-bounds)",
 )
 
 

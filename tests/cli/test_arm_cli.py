@@ -213,6 +213,8 @@ def test_import_checks_the_readings(aacmm, tmp_path, few, paper_arm, paper_captu
     shown = " ".join(aacmm("import", "m.toml", "--check").stdout.split())
     assert sorted(tmp_path.iterdir()) == before
     assert "The readings fit as they are" in shown
-    assert "Joint 5 hardly moves (0.1 deg over 60 poses): alpha_5, a_5, d_5 and theta_5 cannot be identified;" in shown
+    assert (
+        "Joint 5 moves too little (0.1 deg over 60 poses): alpha_5, a_5, d_5 and theta_5 cannot be identified;" in shown
+    )
     assert "the manifest uses the readings that fit better: a calibration with the measured readings leaves" in shown
     assert "--check" in aacmm("import", "m.toml", expect=2).stderr

@@ -1,4 +1,4 @@
-"""Directions that have a rank of their own and are hardly determined all the same: named, fixed by choice, part of
+"""Directions that have a rank of their own and are poorly determined all the same: named, fixed by choice, part of
 u."""
 
 import numpy as np
@@ -101,6 +101,6 @@ def test_a_bound_that_ends_such_a_direction_is_part_of_u(panda, capture, method)
     specification = aj.kinematics.ArmSpecification(nominal, "test", held=REDUNDANT)
     record = aj.calibration.record_of(result, aj.Recording(capture, specification))
     text = " ".join(sentences(findings_of(record)))
-    assert "On a bound because the data hardly determine these parameters: theta_6" in text
+    assert "On a bound because the data determine these parameters poorly: theta_6" in text
     assert "do not widen the bounds" in text
     assert "widen the bounds unless they are known limits" not in text
