@@ -254,7 +254,7 @@ class _Search:
         results = []
         of_relations = self._in_relations()
         for number_of_cause, (cause, test) in enumerate(zip(causes, tests, strict=True)):
-            if number_of_cause < len(of_relations) and of_relations[number_of_cause]:
+            if not cause.named or (number_of_cause < len(of_relations) and of_relations[number_of_cause]):
                 continue
             probability = test.probability * number[cause.family]
             if test.degrees_of_freedom[0] and probability < (LEVEL if cause.family == "function" else _LEVEL):

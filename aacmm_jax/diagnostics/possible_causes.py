@@ -6,14 +6,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..core.distributions import student_tail
 from ..model.observed import Observed
 from .equations import PRIOR, Rows, lengths_in_solve
 from .findings import Case
 from .hypotheses import couplings, fixed_parameters, shifted_seats, steps
 from .missing_terms import MissingTerm, missing_terms
+from .residual_tests import LEVEL
 
 _FEWEST = 6  # poses of a socket or observation whose scatter is compared with that of the others
 _MOST_GROUPS = 60
+_SEVERAL = 4  # lengths, from which they are compared with each other
+_FAR = 10.0  # residual of a length over the scatter of the others, from which it stands out in any case
 _APART = 0.01  # part of a fixed parameter's effect that no free one has, below which it is redundant
 _SMALL = 1e-9  # singular value, relative to the largest
 
@@ -27,6 +31,7 @@ class Cause(NamedTuple):
     term: MissingTerm | None = None
     row: int = -1  # of the relations
     of_noise: Callable[[Rows], np.ndarray] | None = None  # (m, r, c): errors that scatter along these
+    named: bool = True  # whether it is named; a cause that is not still counts among the explanations of other effects
 
 
 def of_functions(case: Case) -> list[Cause]:
@@ -82,10 +87,25 @@ def of_certified(case: Case) -> list[Cause]:
         labels, size = points.get(part, ()), np.asarray(value).size
         whole = [part.partition(" of ")[2] or part] * size
         names += [label for label in labels for _ in range(3)] if 3 * len(labels) == size else whole
-    total = sum(len(block.residual) for block in case.chunks[1] if block.fixture != PRIOR)
-    if len(names) != total:
+    residuals = [block.residual for block in case.chunks[1] if block.fixture != PRIOR]
+    if len(names) != sum(map(len, residuals)):
         return []
-    return [Cause("certified", "certified", name, row=row) for row, name in enumerate(names)]
+    causes = [Cause("certified", "certified", name, row=row) for row, name in enumerate(names)]
+    if len(lengths) < _SEVERAL:
+        return causes
+    # Where all lengths scatter more than their certificates, as errors of places make them do, one is wrong only if it
+    # stands out: its squared studentised residual, over the mean square of the others without it.
+    first, number = len(case.left.values) - sum(len(block.residual) for block in case.chunks[1]), len(lengths)
+    rows = slice(first, first + number)
+    projector = np.eye(number) - case.left.basis[rows] @ case.left.basis[rows].T
+    deleted = projector / np.maximum(np.diag(projector), _SMALL)  # what deleting each one changes
+    squares = case.left.values[rows] ** 2 / np.maximum(np.diag(projector), _SMALL)
+    others = np.sum((case.left.values[rows][:, None] - deleted * case.left.values[rows]) ** 2, axis=0)
+    freedom = np.maximum(np.trace(projector) - np.sum(deleted * projector, axis=0), 1.0)
+    ratios = np.sqrt(squares / np.maximum(others / freedom, 1.0))
+    # Few degrees of freedom leave the scatter of the others open, but not by a power of ten.
+    stands_out = (number * student_tail(ratios, freedom) < LEVEL) | (ratios > _FAR)
+    return [cause._replace(named=cause.row >= number or bool(stands_out[cause.row])) for cause in causes]
 
 
 def of_variances(case: Case, rows: Sequence[Rows]) -> list[Cause]:

@@ -126,6 +126,21 @@ def test_one_of_two_lengths_is_mistyped(paper_arm):
     assert not any("compliant" in finding.sentence for finding in others)
 
 
+def test_lengths_that_all_scatter_accuse_no_single_one(paper_arm):
+    """As errors of places make them scatter on a real arm."""
+    pairs = [("A", "B"), ("C", "D"), ("A", "C"), ("B", "D"), ("A", "D"), ("B", "C")]
+    lengths = [(*pair, 0.002) for pair in pairs]
+    sound = aj.simulate(paper_arm, SOCKETS, poses=20, lengths=lengths, noise=NOISE, seed=2)
+    errors = np.array([0.02, -0.016, 0.024, -0.022, 0.014, -0.018])
+    wrong = [aj.ReferenceLength(r.start, r.end, r.value + e, r.u) for r, e in zip(sound.lengths, errors, strict=True)]
+    bounds = aj.Bounds.around(paper_arm, aj.Parameters.free_of(paper_arm))
+    result = aj.calibrate(paper_arm, aj.Capture(sound.sockets, wrong), bounds, method="joint", noise=NOISE)
+    record = aj.calibration.record_of(
+        result, aj.Recording(aj.Capture(sound.sockets, wrong), ArmSpecification(paper_arm, "test"))
+    )
+    assert not [culprit.name for culprit in culprits_of(case_of(record)) if culprit.kind == "certified"]
+
+
 def test_a_certified_coordinate_is_mistyped(paper_arm):
     holes = {"1": (0, 0, 0), "2": (300, 0, 0), "3": (300, 300, 0), "4": (0, 300, 50), "5": (150, 100, 80)}
     places = [(0.1, 0.2, 0.3, 300.0, -100.0, 100.0), (-0.2, 0.3, 1.0, 350.0, 100.0, 200.0)]
