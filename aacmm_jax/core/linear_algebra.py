@@ -69,7 +69,8 @@ def matrix_products(left: Float[AnyArray, "r s m"], right: Float[AnyArray, "s c 
 
 def rows_times(rows: Float[AnyArray, "*batch p"], matrix: Float[AnyArray, "p q"]) -> Float[AnyArray, "*batch q"]:
     """Every row times a matrix, by one product: NumPy computes a batch of products of few rows one by one."""
-    return (rows.reshape(math.prod(rows.shape[:-1]), matrix.shape[0]) @ matrix).reshape(*rows.shape[:-1], matrix.shape[1])
+    flat = rows.reshape(math.prod(rows.shape[:-1]), matrix.shape[0])
+    return (flat @ matrix).reshape(*rows.shape[:-1], matrix.shape[1])
 
 
 def quadratic_forms(rows: Float[AnyArray, "*batch p"], matrix: Float[AnyArray, "p p"]) -> Float[AnyArray, "*batch"]:
