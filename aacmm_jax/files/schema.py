@@ -15,6 +15,9 @@ RECORDING: Fields = {
     "measured": text("day of the measurement"),
     "acceptance": text("standards whose acceptance procedure was followed", among=("", *STANDARDS)),
     "measuring_range": number("diameter of the measuring volume, as the maker states it", "mm"),
+    "stated": text(
+        "what the manifest states of the readings and points", among=("", "columns", "sign", "offset", "unit", "units")
+    ),
 }
 
 NOISE: Fields = {

@@ -99,7 +99,9 @@ def evaluate_capture(record: CalibrationRecord, recording: Recording, **options:
     """
     chosen = EvaluationOptions(**options)
     used = {row.tobytes() for row in np.asarray(record.recording.capture.readings)}
-    capture, corrected = with_readings_of_arm(record, recording.capture.select(chosen.only, chosen.without))
+    capture, corrected = with_readings_of_arm(
+        record, recording.capture.select(chosen.only, chosen.without), recording.stated
+    )
     capture = _divided(record.calibrated.arm, capture, used)
     check_geometry(record.calibrated.arm, capture)
     readings = dict(capture.sockets) | {part.name: part.q for part in capture.observations}
