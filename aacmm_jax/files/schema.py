@@ -265,6 +265,13 @@ UNCERTAINTY: Fields = {
     "scatter_degrees_of_freedom": number("degrees of freedom of the noise", "1", least=0),
 }
 
+KEPT_GEOMETRY: Fields = {
+    "names": text("part of the geometry", "kept", name="kept"),
+    "values": number("value, as the calibration found it", "mm or rad", "kept"),
+    "follow": number("derivatives with respect to the parameters", "quotients of units", "kept", "kept_parameter"),
+    "covariance": number("covariance for given parameters", "products of units", "kept", "kept_2"),
+}
+
 JUDGED: Fields = {
     "limits": mapping("MPE of each metric: constant term (mm) and divisor of the length"),
     "u_test": number("standard uncertainty due to seat and fixture", "mm", least=0),

@@ -46,8 +46,8 @@ def with_full_couplings(record: CalibrationRecord, solve: Solve, recorded: Recor
     """The calibration with joints that move by the readings of others as well, where the readings do not fit the arm
     without (`search_couplings`); else as it is.
 
-    Where a model is stated (not ``further``), only its own couplings are set, and none with a stated value. A coupling is a coefficient like any
-    other, but its nominal value, which is the mean of its prior, is 1 or -1 instead of 0.
+    Where a model is stated (not ``further``), only its own couplings are set, and none with a stated value. A coupling
+    is a coefficient like any other, but its nominal value, which is the mean of its prior, is 1 or -1 instead of 0.
     """
     nominal, capture = record.recording.nominal, record.recording.capture
     try:
