@@ -86,10 +86,11 @@ def evaluate(
     max_length_error_mm: float | None = option(
         "Exit with code 1 if the error of any length is larger than this.", min=0
     ),
-    keep: list[Literal["target", "frame"]] | None = option(
+    keep: list[str] | None = option(
         "Keep what the calibration found instead of fitting it to the capture: the position of the target on the arm "
         "('target', if it was not remounted), or the frame of the instrument or artefact in the base frame ('frame', "
-        "if neither has moved). May be given twice."
+        "if neither has moved). May be given twice.",
+        "[target|frame]",
     ),
     residuals: Path | None = options.RESIDUALS,
     as_json: bool = options.JSON,

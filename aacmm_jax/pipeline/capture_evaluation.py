@@ -29,7 +29,7 @@ from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.arguments import NotNegative, checked_arguments, with_options
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
-from ..core.text import shorten
+from ..core.text import listed, shorten
 from ..data.capture import Capture
 from ..data.recording import Recording
 from ..diagnostics.findings import findings_of, sentences
@@ -244,14 +244,20 @@ def _warnings(
 def _kept(record: CalibrationRecord, uncertainty: Uncertainty, capture: Capture, keep: Sequence[str]) -> KeptGeometry:
     """The geometry of the calibration that is kept. Raises `InputError` where calibration and capture have none."""
     kinds = {"target": ("offset of ", "orientation of "), "frame": ("frame of ",)}
-    shared = [name for name in Observed.of(capture, None).names if name in record.observed.geometry]
-    parts = [name for name in shared if name.startswith(tuple(start for kind in keep for start in kinds[kind]))]
+    in_capture, found = Observed.of(capture, None).names, record.observed.geometry
+    parts: list[str] = []
     for kind in keep:
-        if not any(name.startswith(kinds[kind]) for name in parts):
+        of_kind, of_calibration = (
+            [name for name in names if name.startswith(kinds[kind])] for names in (in_capture, found)
+        )
+        same = [name for name in of_kind if name in of_calibration]
+        if not same:
             raise InputError(
-                f"--keep {kind} (keep) keeps the {kind} that the calibration found, but calibration and capture have "
-                f"no {kind} of the same name; leave it out."
+                f"--keep {kind} (keep) needs a {kind} of the same name in calibration and capture, but the calibration "
+                f"has {listed(of_calibration) or 'none'}, and the capture has {listed(of_kind) or 'none'}; leave the "
+                "option out, or rename the one in the capture."
             )
+        parts += same
     complete = to_numpy(to_numpy(uncertainty).complete)
     observed = to_numpy(Observed.of(record.recording.capture, complete.arm))
     numbers = [np.asarray(record.observed.geometry[name]) for name in observed.blocks]
