@@ -253,8 +253,8 @@ def _kept(record: CalibrationRecord, uncertainty: Uncertainty, capture: Capture,
         same = [name for name in of_kind if name in of_calibration]
         if not same:
             raise InputError(
-                f"--keep {kind} (keep) needs a {kind} of the same name in calibration and capture, but the calibration "
-                f"has {listed(of_calibration or ['none'])}, and the capture has {listed(of_kind or ['none'])}; leave the "
+                f"--keep {kind} (keep) needs a {kind} of the same name in both, but the calibration has "
+                f"{listed(of_calibration or ['none'])}, and the capture has {listed(of_kind or ['none'])}; leave the "
                 "option out, or rename the one in the capture."
             )
         parts += same

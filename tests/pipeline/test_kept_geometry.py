@@ -24,8 +24,10 @@ def measured(random, true, poses, moved=(0.0, 0.0, 0.0), name="tracker"):
 
 def calibrated(seed, poses=12):
     random, nominal = np.random.default_rng(seed), aj.files.load_specification("ur10e")
-    theta = np.asarray(nominal.arm.theta) + [0, 1e-3, -1e-3, 0, 0, 0]
-    true = nominal.arm.replace(a=np.asarray(nominal.arm.a) + [0, 0.5, 0, 0, 0, 0], theta=theta)
+    a, theta = np.array(nominal.arm.a), np.array(nominal.arm.theta)
+    a[1] += 0.5
+    theta[1:3] += 1e-3, -1e-3
+    true = nominal.arm.replace(a=a, theta=theta)
     others = [name for name in nominal.space().names if name not in FREE]
     nominal = nominal._replace(held=(*nominal.space().held, *others), free=())
     recording = aj.Recording(measured(random, true, poses), nominal)
