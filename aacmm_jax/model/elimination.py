@@ -212,7 +212,8 @@ def _blocks(z: Float[AnyArray, " z"], args: Args) -> list[RowBlock]:
     """The rows at a point; those of components without unknowns are where these fit best."""
     space, observed, whitening, _, linear, batch = args
     whole = z if linear is None else namespace(z, linear).concatenate([z, linear])
-    blocks = row_blocks(space, observed, whole, rows_at(space, observed, whole, batch is not None), whitening)
+    point = rows_at(space, observed, whole, batch is not None, bool(whitening.bases))
+    blocks = row_blocks(space, observed, whole, point, whitening)
     first = len(observed.layout.classes) - args.eliminated
     return [_fitted(block) if block.class_index >= first else block for block in blocks]
 
