@@ -109,6 +109,12 @@ class Observed:
         known = (is_known(u) for _, u in self.certified().values())
         return int(rows) + len(self.ends) + sum(int(np.sum(mask)) for mask in known)
 
+    @cached_property
+    def arm_equations(self) -> int:
+        """Those of them that show errors of the arm: not what is left of rows that are reduced."""
+        rest = (observation.equations for observation in self.observations)
+        return self.equations - sum(int(counts[-1].sum()) for counts in rest if counts is not None)
+
     def split(self, geometry: Float[AnyArray, " g"]) -> dict[str, Float[AnyArray, " k"]]:
         """The numbers of each part."""
         ends = np.cumsum([0, *(len(units) for _, units in self.layout.parts)]).tolist()

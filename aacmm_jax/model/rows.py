@@ -66,6 +66,7 @@ class RowBlock(eqx.Module):
     by_own: Float[AnyArray, "k r m"] | None
     class_index: int = eqx.field(static=True)  # index of the class of these components; -1 without
     sizes: tuple[int, ...] = eqx.field(static=True)  # poses of each of them, in their order
+    counts: tuple[int, ...] = eqx.field(static=True, default=())  # equations of each pose, where these are not r
 
 
 class PointRows(NamedTuple):
@@ -145,7 +146,8 @@ def row_blocks(
             by_roles.append(times(rows.by_tip, xp.stack([axis[:, poses] for axis in forward.frame])))
         by_head = _by_head(by_parameters, by_roles, group, layout.shared)
         by_own = None if group.class_index < 0 else _by_own(by_roles, group, layout.classes[group.class_index][1])
-        blocks.append(RowBlock(rows.values, by_head, by_own, group.class_index, group.sizes))
+        counts = tuple(stack.pose_equations.tolist()) if stack.reduces else ()
+        blocks.append(RowBlock(rows.values, by_head, by_own, group.class_index, group.sizes, counts))
     return [*blocks, *_relations(observed, z[p:], whitening, p)]
 
 

@@ -176,6 +176,11 @@ class AbstractObservation(Declared):
         """The unit of the residuals that are not in mm; empty where all of them are."""
         return self.row_units[-1] if self.rows > self.lengths else ""
 
+    def other_sizes(self, rows: Float[AnyArray, "r m"]) -> Float[AnyArray, " m"]:
+        """The size of each pose's residuals that are not in mm; of a corner, where there are several."""
+        xp = namespace(rows)
+        return xp.sqrt(xp.sum(rows[self.lengths :] ** 2, axis=0))
+
     def in_mm(self, rows: Float[AnyArray, "r *k m"], by_tip: Float[AnyArray, "r 3 m"]) -> Float[AnyArray, "c *k m"]:
         """Residuals, or their derivatives by k numbers, as a vector whose length is the distance of the tip from the
         geometry, mm: the residuals in mm themselves; of a kind without any, the shortest displacement of the tip that

@@ -250,6 +250,9 @@ class Pixels(AbstractObservation):
         made = super().in_session(session, probe)
         return made.changed(still=f"{session}/{self.still}")
 
+    def other_sizes(self, rows: Float[AnyArray, "r m"]) -> Float[AnyArray, " m"]:
+        return super().other_sizes(rows) / namespace(rows).asarray(np.sqrt(self.seen.sum(axis=1)))
+
     def in_mm(self, rows: Float[AnyArray, "r *k m"], by_tip: Float[AnyArray, "r 3 m"]) -> Float[AnyArray, "c *k m"]:
         return displacement(rows, by_tip)
 
