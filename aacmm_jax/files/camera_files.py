@@ -51,7 +51,12 @@ def read_camera(path: str | os.PathLike) -> StoredCamera:
         if matrix.size != 9:
             raise InputError(f"the camera matrix has {matrix.size} numbers; give 3 x 3.")
         matrix = matrix.reshape(3, 3)
-        if matrix[0, 1] or matrix[1, 0] or not np.array_equal(matrix[2], [0, 0, 1]) or min(matrix[0, 0], matrix[1, 1]) <= 0:
+        if (
+            matrix[0, 1]
+            or matrix[1, 0]
+            or not np.array_equal(matrix[2], [0, 0, 1])
+            or min(matrix[0, 0], matrix[1, 1]) <= 0
+        ):
             raise InputError("the camera matrix is not [fx 0 cx; 0 fy cy; 0 0 1] with positive fx and fy; correct it.")
         distortion = _numbers(entries, _DISTORTION, "distortion coefficients")
         words = str(entries.get("distortion_model", "")).lower()
@@ -149,7 +154,11 @@ def camera_info_yaml(name: str, camera: StoredCamera) -> str:
         "rectification_matrix": (3, 3, np.eye(3).ravel()),
         "projection_matrix": (3, 4, [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0]),
     }
-    lines = [f"image_width: {camera.image_size[0]}", f"image_height: {camera.image_size[1]}", f"camera_name: {_word(name)}"]
+    lines = [
+        f"image_width: {camera.image_size[0]}",
+        f"image_height: {camera.image_size[1]}",
+        f"camera_name: {_word(name)}",
+    ]
     for key, (rows, columns, data) in matrices.items():
         if key == "distortion_coefficients":
             lines.append(f"distortion_model: {model}")
@@ -183,7 +192,8 @@ def static_transform(parent: str, child: str, transform: Float[np.ndarray, "4 4"
 
     values = [*(transform[:3, 3] / 1000), *Rotation.from_matrix(transform[:3, :3]).as_quat()]
     options = " ".join(
-        f"--{name} {_listed([value])}" for name, value in zip(("x", "y", "z", "qx", "qy", "qz", "qw"), values, strict=True)
+        f"--{name} {_listed([value])}"
+        for name, value in zip(("x", "y", "z", "qx", "qy", "qz", "qw"), values, strict=True)
     )
     frames = f"--frame-id {_word(parent)} --child-frame-id {_word(child)}"
     return f"ros2 run tf2_ros static_transform_publisher {options} {frames}\n"

@@ -12,7 +12,7 @@ from ..core.errors import InputError
 from ..core.text import is_number, quoted
 from ..data.targets import AbstractTarget
 from .inputs import InputFile
-from .manifest_tables import Picked, as_list
+from .manifest_files import Picked, as_list
 from .text_lines import Column
 from .text_table import TextTable
 
@@ -30,6 +30,7 @@ _LISTS = {
     "points": ("object_points", "objpoints", "points_3d"),
     "images": ("images", "names", "files"),
 }
+NO_CORNERS = (np.zeros(0, dtype=int), np.zeros((0, 2)))
 _SAME = 1e-3  # of the size of the target, between an object point and the point of the target that it is
 
 
@@ -41,12 +42,9 @@ class Seen(NamedTuple):
     corners: Float[np.ndarray, "k d"]
     refused: str = ""  # why it is not used
     size: tuple[int, int] | None = None  # width, height, px
-    sigma: Float[np.ndarray, " k"] | None = None
 
 
-def read_corners(
-    file: InputFile, target: AbstractTarget, dimensions: int, columns: Mapping[str, Picked]
-) -> list[Seen]:
+def read_corners(file: InputFile, target: AbstractTarget, dimensions: int, columns: Mapping[str, Picked]) -> list[Seen]:
     """The corners of each image, in the order of the file.
 
     Args:
@@ -85,7 +83,11 @@ def _of_json(file: InputFile, target: AbstractTarget, dimensions: int) -> list[S
         content: Any = json.loads(file.text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{file} is not valid JSON ({error}); correct the file.") from error
-    content = {str(key).lower(): value for key, value in content.items()} if isinstance(content, dict) else {"corners": content}
+    content = (
+        {str(key).lower(): value for key, value in content.items()}
+        if isinstance(content, dict)
+        else {"corners": content}
+    )
     lists = {key: next((content[name] for name in names if name in content), None) for key, names in _LISTS.items()}
     if not isinstance(lists["corners"], list) or not lists["corners"]:
         raise InputError(f"{file} has no list of corners; give 'image_points' with one list for each image.")
@@ -117,9 +119,13 @@ def _nested(file: InputFile, label: str, value: Any, width: int) -> Float[np.nda
     try:
         numbers = np.array(value, dtype=float)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{file} image {quoted(label)} has lists of different lengths, or texts; correct it.") from error
+        raise InputError(
+            f"{file} image {quoted(label)} has lists of different lengths, or texts; correct it."
+        ) from error
     if numbers.size % width or not np.all(np.isfinite(numbers)):
-        raise InputError(f"{file} image {quoted(label)} has corners that are not {width} finite numbers each; correct it.")
+        raise InputError(
+            f"{file} image {quoted(label)} has corners that are not {width} finite numbers each; correct it."
+        )
     return numbers.reshape(-1, width)
 
 
@@ -138,7 +144,7 @@ def _ids_of(
     return target.ids[nearest]
 
 
-def matched(labels: Sequence[str], wanted: Sequence[str] | None, poses: int, where: str) -> list[int]:
+def matched(labels: Sequence[str], wanted: Sequence[str] | None, poses: int) -> list[int]:
     """For each pose the number of its image among the ``labels``; ``wanted`` are the names in the table of readings.
 
     Raises `InputError` where it is not clear which image belongs to which pose, or two poses share one.
@@ -147,11 +153,11 @@ def matched(labels: Sequence[str], wanted: Sequence[str] | None, poses: int, whe
         if all(map(is_number, labels)) and labels:
             first = 0 if "0" in labels else 1
             by_number = {int(float(label)) - first: i for i, label in enumerate(labels)}
-            if len(by_number) == len(labels) and 0 <= min(by_number) and max(by_number) < poses:
+            if len(by_number) == len(labels) and min(by_number) >= 0 and max(by_number) < poses:
                 return [by_number.get(pose, -1) for pose in range(poses)]
         if len(labels) != poses:
             raise InputError(
-                f"{where} has {len(labels)} images and {poses} poses; give one row of readings for each image, or a "
+                f"there are {len(labels)} images and {poses} poses; give one row of readings for each image, or a "
                 "column 'image' with the names of the files."
             )
         return list(range(poses))
@@ -165,10 +171,10 @@ def matched(labels: Sequence[str], wanted: Sequence[str] | None, poses: int, whe
         found = next((keys[key] for key in (name, tail, _stem(tail)) if key in keys), [])
         if len(found) != 1:
             many = f"{len(found)} images have this name" if found else "there is no such image"
-            raise InputError(f"{where}: row {row} of the readings names the image {quoted(name)}, but {many}; correct it.")
+            raise InputError(f"row {row} of the readings names the image {quoted(name)}, but {many}; correct it.")
         if found[0] in indices:
             raise InputError(
-                f"{where}: rows {indices.index(found[0]) + 1} and {row} of the readings name the same image "
+                f"rows {indices.index(found[0]) + 1} and {row} of the readings name the same image "
                 f"{quoted(name)}; give one image for each pose."
             )
         indices.append(found[0])
@@ -181,4 +187,6 @@ def _stem(name: str) -> str:
 
 def natural_order(names: Sequence[str]) -> list[str]:
     """Names in the order in which people count: img_2 before img_10."""
-    return sorted(names, key=lambda name: [(int(x), "") if x.isdecimal() else (-1, x) for x in re.split(r"(\d+)", name)])
+    return sorted(
+        names, key=lambda name: [(int(x), "") if x.isdecimal() else (-1, x) for x in re.split(r"(\d+)", name)]
+    )

@@ -4,17 +4,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, FiniteFloat, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
-from .manifest_tables import Picked, _Named
+from .manifest_files import NamedTable, Picked
 from .toml import Strict
 
 _Counts = Annotated[list[PositiveInt], Field(min_length=2, max_length=2)]
-_OF_KIND = {
-    "checkerboard": ("squares", "size"),
-    "charuco": ("squares", "size", "marker", "dictionary", "legacy"),
-    "tags": ("tags", "size", "gap", "dictionary", "first"),
-    "points": ("file", "columns", "units", "dictionary"),
-}
-_OPTIONAL = ("dictionary", "legacy", "first", "columns", "units")
 
 
 class Bar(Strict):
@@ -36,27 +29,17 @@ class TargetTable(Strict):
     marker: PositiveFloat | None = None
     gap: PositiveFloat | None = None
     dictionary: str | None = None
-    legacy: bool = False
-    first: NonNegativeInt = 0  # id of the first tag
+    legacy: bool | None = None
+    first: NonNegativeInt | None = None  # id of the first tag
     bar: Bar | None = None
     file: str | None = None  # of points: id, x, y, z
     columns: dict[str, Picked] = Field(default_factory=dict)
     units: dict[str, str] = Field(default_factory=dict)
 
-    @model_validator(mode="after")
-    def _fits_kind(self) -> "TargetTable":
-        wanted = _OF_KIND[self.kind]
-        for key in sorted(self.model_fields_set - {"name", "kind", "bar"} - set(wanted)):
-            raise ValueError(f"{key} does not apply to the target kind '{self.kind}'; remove it.")
-        for key in wanted:
-            if key not in _OPTIONAL and getattr(self, key) is None:
-                raise ValueError(f"the target kind '{self.kind}' needs the key '{key}'.")
-        return self
-
+    @property
     def keys(self) -> dict[str, Any]:
-        """What `target_of` takes of a board."""
-        keys = self.model_dump(exclude_unset=True, exclude={"name", "file", "columns", "units"})
-        return keys | ({} if self.bar is None else {"bar": (self.bar.nominal, self.bar.measured, self.bar.u)})
+        """What `target_of` takes; of a table of points without these."""
+        return self.model_dump(exclude_unset=True, exclude={"name", "file", "columns", "units"})
 
 
 class CameraTable(Strict):
@@ -79,7 +62,7 @@ class CameraTable(Strict):
         return self
 
 
-class PixelsTable(_Named):
+class PixelsTable(NamedTable):
     """Poses in which a camera saw a target: a table of readings, and images or a table of corners."""
 
     camera: str

@@ -16,8 +16,9 @@ from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.observations.declared import Entry
 from ..data.observations.observation import AbstractObservation
 from .inputs import InputFile, fingerprint
+from .manifest_files import PRESETS, Preset, as_list
 from .manifest_readings import Wanted, checked_unit
-from .manifest_tables import NUMBERS_OF_ROTATION, PRESETS, Preset, as_list
+from .manifest_tables import NUMBERS_OF_ROTATION
 from .patterns import check_name, fields_of, fill
 from .text_lines import TABLE_SHARE, Column
 from .text_table import TextTable
@@ -116,7 +117,8 @@ class _Reader:
 
     def __init__(self, source: Source, kind: type[AbstractObservation], table: Any, where: str):
         self._source, self._table, self._where = source, table, where
-        self._preset = PRESETS[table.preset] if table.preset is not None else Preset({})
+        preset = PRESETS[table.preset] if table.preset is not None else Preset({})
+        self._preset = preset._replace(columns=getattr(kind, "usual", {}) | preset.columns)
         # In a manifest of points, a point stands where a pose has its readings.
         self.entries = {source.quantity if entry.name == "q" else entry.name: entry for entry in kind.entries}
         columns = table.columns if isinstance(table.columns, dict) else {source.quantity: table.columns}
