@@ -166,9 +166,9 @@ def camera_info_yaml(name: str, camera: StoredCamera) -> str:
     return "\n".join(lines) + "\n"
 
 
-def transform_storage(name: str, transform: Float[np.ndarray, "4 4"]) -> str:
+def transform_storage(parent: str, child: str, transform: Float[np.ndarray, "4 4"]) -> str:
     """A transform as OpenCV's ``FileStorage`` (YAML): 4 x 4 matrix, and rotation and translation (mm) alone."""
-    lines = ["%YAML:1.0", "---", f"name: {_word(name)}"]
+    lines = ["%YAML:1.0", "---", f"parent: {_word(parent)}", f"child: {_word(child)}"]
     parts = {"transform": transform, "rotation": transform[:3, :3], "translation_mm": transform[:3, 3:]}
     for key, matrix in parts.items():
         rows, columns = matrix.shape
@@ -199,9 +199,9 @@ def static_transform(parent: str, child: str, transform: Float[np.ndarray, "4 4"
     return f"ros2 run tf2_ros static_transform_publisher {options} {frames}\n"
 
 
-def matrix_text(transform: Float[np.ndarray, "4 4"]) -> str:
-    """A transform as four lines of four numbers, mm."""
-    return "".join(f"{_listed(row, ' ')}\n" for row in transform)
+def matrix_text(parent: str, child: str, transform: Float[np.ndarray, "4 4"]) -> str:
+    """A transform as four lines of four numbers, mm, below a comment."""
+    return f"# {_word(child)} in {_word(parent)}, mm\n" + "".join(f"{_listed(row, ' ')}\n" for row in transform)
 
 
 def _word(name: str) -> str:
