@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..core.arrays import Numbers
+from ..core.linear_algebra import rows_times
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
@@ -165,11 +166,9 @@ def _of_part(
     to_mm = np.moveaxis(np.asarray(observation.in_mm(to_mm, by_tip)), -1, 0)
     a, g = np.moveaxis(by_parameters, -1, 0).swapaxes(1, 2), np.moveaxis(by_geometry, -1, 0).swapaxes(1, 2)
     by_arm, by_place = to_mm @ a, to_mm @ g
-    of_arm = np.where(
-        used[:, None, None],
-        by_arm @ covariances[1] @ by_arm.swapaxes(1, 2),
-        covariances[0].covariance_of_functions(by_arm),
-    )
+    of_arm = np.empty((m, by_arm.shape[1], by_arm.shape[1]))
+    of_arm[used] = rows_times(by_arm[used], covariances[1]) @ by_arm[used].swapaxes(1, 2)
+    of_arm[~used] = covariances[0].covariance_of_functions(by_arm[~used])
     of_place = np.where(fitted, -1.0, 1.0)[:, None, None] * (by_place @ by_place.swapaxes(1, 2))
     variances = to_mm @ to_mm.swapaxes(1, 2) + of_arm + of_place
     u = np.sqrt(np.maximum(np.einsum("mcc->m", variances), 0.0))

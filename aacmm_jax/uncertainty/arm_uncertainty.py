@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from ..core.arrays import Numbers, is_concrete
 from ..core.errors import InputError
-from ..core.linear_algebra import semidefinite_eigen
+from ..core.linear_algebra import quadratic_forms, rows_times, semidefinite_eigen
 from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known, to_numpy
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm, checked_readings
@@ -136,7 +136,7 @@ class Uncertainty(eqx.Module):
     def parts(self, derivatives: Float[AnyArray, "... p"]) -> Float[AnyArray, "... c"]:
         """Variances of quantities with these derivatives by the parameters: by the scatter, then by `components`."""
         xp = namespace(self, derivatives)
-        whole = xp.einsum("...p,pq,...q->...", derivatives, self.covariance, derivatives)[..., None]
+        whole = quadratic_forms(derivatives, self.covariance)[..., None]
         if self.components is None:
             return whole
         others = self.components.variances(derivatives)
@@ -266,7 +266,7 @@ class Uncertainty(eqx.Module):
     def covariance_of_functions(self, derivatives: Float[AnyArray, "... k p"]) -> Float[AnyArray, "... k k"]:
         """Covariance of functions of the parameters with these derivatives; infinite where they follow what is open."""
         xp = namespace(self, derivatives)
-        covariance = derivatives @ self.covariance @ xp.swapaxes(derivatives, -1, -2)
+        covariance = rows_times(derivatives, self.covariance) @ xp.swapaxes(derivatives, -1, -2)
         return xp.where(self._is_open(derivatives)[..., None], np.inf, covariance)
 
     def parts_of_functions(self, derivatives: Float[AnyArray, "... p"]) -> Float[AnyArray, "... c"]:
@@ -290,7 +290,9 @@ class Uncertainty(eqx.Module):
     def _is_open(self, derivatives: Float[AnyArray, "... k p"]) -> Bool[AnyArray, "... k"]:
         """Which rows follow an undetermined direction."""
         xp = namespace(self, derivatives)
-        inside = derivatives @ (self.space.scale[:, None] * self.open)
+        if xp is np and not np.any(self.open):
+            return np.zeros(derivatives.shape[:-1], dtype=bool)
+        inside = rows_times(derivatives, self.space.scale[:, None] * self.open)
         return xp.sqrt(xp.sum(inside**2, axis=-1)) > _LEAST_COMPONENT
 
 
