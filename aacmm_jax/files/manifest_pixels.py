@@ -3,7 +3,7 @@
 import glob
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -13,7 +13,7 @@ from ..core.text import quoted, shorten
 from ..core.units import LENGTH_UNITS
 from ..data.cameras.camera import AbstractCamera, camera_models
 from ..data.observations.corner_tables import Camera, CornerTable, pixels_of
-from ..data.observations.declared import Entry
+from ..data.observations.declared import Declared, declared
 from ..data.observations.pixels import Pixels
 from ..data.recording import ReadImage
 from ..data.targets import AbstractTarget, target_of
@@ -35,14 +35,12 @@ def without_progress(items: Sequence[Any], what: str) -> Iterable[Any]:
     return items
 
 
-class _Poses:
-    """What the table of readings holds, as a kind of observation declares it."""
+class _Poses(Declared):
+    """What the table of readings holds."""
 
-    entries = (
-        Entry("joint reading", "rad", ("pose", "joint"), name="q"),
-        Entry("name of the image", "", ("pose",), default="", name="image", annotation=str),
-    )
-    usual: Mapping[str, Any] = {"image": [["image"], ["file"], ["filename"], ["frame"]]}
+    q: Float[np.ndarray, "m n"] = declared("joint reading", "rad", "pose", "joint")
+    image: str = declared("name of the image", "", "pose", default="")
+    usual: ClassVar[Mapping[str, Any]] = {"image": [["image"], ["file"], ["filename"], ["frame"]]}
 
 
 class Cameras:
@@ -147,7 +145,7 @@ def observations_of(
     where = f"[[pixels]] '{name}'"
     with naming(where):
         target, camera = cameras.target(fill(entry.target, values)), cameras.camera(fill(entry.camera, values))
-    taken = list(parts(source, _Poses, entry, values, where))  # pyright: ignore[reportArgumentType]
+    taken = list(parts(source, _Poses, entry, values, where))
     with naming(where):
         seen = [_checked(image, camera, target) for image in _seen(source, entry, values, target, camera, show)]
         read: list[ReadImage] = []

@@ -69,7 +69,7 @@ class Pixels(AbstractObservation):
         "point of the target that was seen there, in its frame", "mm", "pose", "corner", "axis"
     )
     ids: Identifiers = declared(
-        "identifier of this point", "", "pose", "corner", more="-1 where the image has no more corners"
+        "identifier of this point", "1", "pose", "corner", more="-1 where the image has no more corners"
     )
     u: Float[AnyArray, "m c d"] = declared(
         "standard deviation of a coordinate of a corner", "px", "pose", "corner", "image_axis", spread=0,
