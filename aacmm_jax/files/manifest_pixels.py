@@ -235,5 +235,7 @@ def _pixels(
         camera = camera._replace(image_size=next((image.size for image in images if image.size), None))
     counts = [len(image.ids) for image in images]
     ids, corners = (np.concatenate([getattr(image, key) for image in images]) for key in ("ids", "corners"))
-    table = CornerTable(np.repeat(np.arange(len(images)), counts), ids, corners, entry.u)
+    table = CornerTable(
+        np.repeat(np.arange(len(images)), counts), ids, corners, entry.u, [image.label for image in images]
+    )
     return pixels_of(name, q, table, target, camera, board=entry.target, on_arm=entry.on_arm == "camera")

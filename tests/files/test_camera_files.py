@@ -74,8 +74,8 @@ def test_camera_info_comes_back(tmp_path, model, distortion):
         ("message.yaml", MESSAGE, "fisheye", [0.1, 0.2, 0.0, -0.1]),
         ("camera.json", json.dumps({"image_width": 640, "image_height": 480, "dist": [[0.1, 0, 0, 0]],
                                     "mtx": np.reshape(MATRIX, (3, 3)).tolist()}), "pinhole", [0.1, 0, 0, 0]),
-        ("camera.json", json.dumps({"image_width": 640, "image_height": 480,
-                                    "distortion_coefficients": {"data": [0] * 14}, "camera_matrix": {"rows": 3, "data": MATRIX}}), "pinhole", [0] * 8),
+        ("camera.json", json.dumps({"width": 640, "height": 480, "distortion_coefficients": {"data": [0] * 14},
+                                    "camera_matrix": {"rows": 3, "data": MATRIX}}), "pinhole", [0] * 8),
     ],
 )  # fmt: skip
 def test_other_formats_are_read(tmp_path, name, text, model, distortion):

@@ -34,10 +34,11 @@ class Fisheye(AbstractLens):
         factor = xp.where(middle, 1 / xp.where(middle, depth, 1.0), sum(k * power for k, power in terms) / r)
         slope = 1.0 + sum((2 * i + 1) * k * t ** (2 * i) for i, (k, _) in enumerate(terms) if i)
         by_radius = xp.where(middle, 0.0, (slope * depth / square - factor) / r2)  # over the radius
-        by_across = across[:, None] * across[None] * by_radius + factor * np.eye(2).reshape(2, 2, *[1] * r2.ndim)
-        by_depth = -across * slope / square
-        by_coefficients = [across * xp.where(middle, 0.0, power / r) for power in powers[1:]]
-        return across * factor, xp.concatenate([by_across, by_depth[:, None]], axis=1), by_coefficients
+        by_across = across[:, None] * across[None] * by_radius[None, None]
+        by_across = by_across + factor[None, None] * np.eye(2).reshape(2, 2, *[1] * r2.ndim)
+        by_depth = -across * (slope / square)[None]
+        by_coefficients = [across * xp.where(middle, 0.0, power / r)[None] for power in powers[1:]]
+        return across * factor[None], xp.concatenate([by_across, by_depth[:, None]], axis=1), by_coefficients
 
     def aside(self, points: Float[np.ndarray, "3 ..."]) -> Float[np.ndarray, "..."]:
         return np.arctan2(np.hypot(points[0], points[1]), points[2])

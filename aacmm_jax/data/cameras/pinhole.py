@@ -35,12 +35,12 @@ class Pinhole(AbstractLens):
         xy, xx, yy = 2 * x * y, r2 + 2 * x**2, r2 + 2 * y**2
         plane = xp.stack([x * scale + p1 * xy + p2 * xx, y * scale + p1 * yy + p2 * xy])
         across = xy * slope + 2 * p1 * x + 2 * p2 * y
-        by_x = xp.stack([scale + 2 * x**2 * slope + 2 * p1 * y + 6 * p2 * x, across]) / depth
-        by_y = xp.stack([across, scale + 2 * y**2 * slope + 6 * p1 * y + 2 * p2 * x]) / depth
-        by_point = xp.stack([by_x, by_y, -(x * by_x + y * by_y)], axis=1)
-        radial, tangential = xp.stack([x, y]) / below, [xp.stack([xy, yy]), xp.stack([xx, xy])]
-        by = [radial * r2, radial * r4, *tangential, radial * r6]
-        by += [-scale * radial * power for power in (r2, r4, r6)]
+        by_x = xp.stack([scale + 2 * x**2 * slope + 2 * p1 * y + 6 * p2 * x, across]) / depth[None]
+        by_y = xp.stack([across, scale + 2 * y**2 * slope + 6 * p1 * y + 2 * p2 * x]) / depth[None]
+        by_point = xp.stack([by_x, by_y, -(x[None] * by_x + y[None] * by_y)], axis=1)
+        radial, tangential = xp.stack([x, y]) / below[None], [xp.stack([xy, yy]), xp.stack([xx, xy])]
+        by = [radial * r2[None], radial * r4[None], *tangential, radial * r6[None]]
+        by += [-radial * (scale * power)[None] for power in (r2, r4, r6)]
         return plane, by_point, by[:count]
 
     def aside(self, points: Float[np.ndarray, "3 ..."]) -> Float[np.ndarray, "..."]:

@@ -17,6 +17,7 @@ _PLANAR = 1e-3  # third singular value of points in a plane, of the first
 _FOCAL_LENGTHS = np.geomspace(0.25, 8.0, 16)  # that are tried, of the image's width
 _FEW = 10  # images that focal lengths are tried with
 _ROUNDS = 40
+_LEAST_USUAL = 0.05  # standard deviations, or px where none is known
 
 
 class Corners(NamedTuple):
@@ -76,7 +77,7 @@ class CameraCalibration(NamedTuple):
         turns = np.moveaxis(np.asarray(rotation_matrix(self.views[:, :3].T)), -1, 0)
         rows = _rows(corners, self.intrinsics, Views(turns, self.views[:, 3:]))[0].reshape(corners.values.shape)
         known = corners.present & np.any(self.views[:, 3:] != 0, axis=1)[:, None]
-        usual = 1.4826 * np.median(np.abs(rows[known])) + 1e-300
+        usual = max(1.4826 * float(np.median(np.abs(rows[known]))), _LEAST_USUAL)
         return np.where(known, np.abs(rows).max(axis=2), 0.0) / usual
 
 

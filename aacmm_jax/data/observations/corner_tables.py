@@ -28,6 +28,9 @@ class Camera(NamedTuple):
             None for infinite.
         image_size: Width and height of its images, px.
         coefficients: How many numbers describe its distortion, if ``intrinsics`` is None.
+
+    Example:
+        >>> known = aj.data.observations.Camera("webcam", intrinsics=(600, 600, 320, 240), u=(5, 5, 3, 3))
     """
 
     name: str
@@ -47,12 +50,17 @@ class CornerTable(NamedTuple):
         corners: Where it was seen ``(N, d)``, px; mm for a camera that measures points.
         u: Standard deviation of a coordinate, one or one for each ``(N, d)``; None to take it from the scatter of the
             corners about the best view of each image.
+        names: Names of the images, in their order.
+
+    Example:
+        >>> table = aj.data.observations.CornerTable([0, 0], [7, 8], [(100.2, 50.1), (140.9, 50.4)], u=0.3)
     """
 
     image: Numbers
     ids: Numbers
     corners: Numbers
     u: Numbers | None = None
+    names: Sequence[str] | None = None
 
 
 def pixels_of(
@@ -75,8 +83,14 @@ def pixels_of(
             the corners do not show the intrinsics.
 
     Example:
-        >>> table = CornerTable(image, ids, corners)
-        >>> seen = pixels_of("webcam", q, table, target, Camera("webcam", image_size=(640, 480)))
+        >>> from types import SimpleNamespace
+        >>> camera = aj.data.observations.Camera("webcam", intrinsics=(600, 600, 320, 240), u=0)
+        >>> target = SimpleNamespace(ids=range(4), points=[(0, 0, 0), (50, 0, 0), (0, 40, 0), (50, 40, 0)], u_scale=0)
+        >>> corners = [(100, 100), (200, 100), (100, 180), (200, 180)]
+        >>> table = aj.data.observations.CornerTable([0] * 4, range(4), corners, u=0.3)
+        >>> eye = aj.data.observations.pixels_of("eye", np.zeros((1, 6)), table, target, camera)
+        >>> print(eye.corners.shape, [*eye.unknowns])
+        (1, 4, 2) ['frame of board', 'orientation of webcam']
     """
     where, m = f"observation '{name}'", len(np.asarray(q))
     image, ids = (_whole(getattr(table, field), f"{field} of {where}") for field in ("image", "ids"))
@@ -109,6 +123,7 @@ def pixels_of(
         intrinsics=intrinsics,
         u_intrinsics=u_intrinsics,
         image_size=camera.image_size,
+        images=None if table.names is None else tuple(table.names),
         u_scale=float(getattr(target, "u_scale", 0.0)),
     )
 
@@ -122,7 +137,9 @@ def _whole(values: Numbers, what: str) -> np.ndarray:
 
 def _points_of(target: Any, ids: np.ndarray, image: np.ndarray, where: str) -> Float[np.ndarray, "N 3"]:
     """The points with these identifiers."""
-    known = {int(i): point for i, point in zip(np.asarray(target.ids), np.asarray(target.points), strict=True)}
+    known = {
+        int(i): point for i, point in zip(np.asarray(target.ids), np.asarray(target.points, dtype=float), strict=True)
+    }
     for i, number in zip(ids, image, strict=True):
         if int(i) not in known:
             raise InputError(

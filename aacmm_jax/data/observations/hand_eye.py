@@ -5,6 +5,8 @@ carries, as the view shows it. X, the place in the last frame of what the arm ca
 still, fulfil T X W = Y in every pose. This start takes all poses at once, in closed form, and counts bad ones less.
 """
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
@@ -36,7 +38,7 @@ def hand_eye(
     arm = xp.moveaxis(axes, -1, 0)  # (m, 3, 3)
     # T X W = Y is linear in the nine numbers of X: with K of all poses, |K x - y|^2 is least where x^T (sum K)^T y is
     # largest (Shah 2013).
-    products = xp.einsum("mij,mlk->mikjl", arm, xp.swapaxes(turns, 1, 2)).reshape(-1, 9, 9)
+    products = xp.einsum("mij,mlk->mikjl", arm, turns).reshape(-1, 9, 9)
     weight = counted
     x = y = xp.asarray(np.eye(3))
     for _ in range(_ROUNDS):
@@ -44,7 +46,7 @@ def hand_eye(
         _, vectors = semidefinite_eigen(total.T @ total)
         x = _rotation((vectors[:, 0]).reshape(3, 3))
         y = _rotation(xp.einsum("m,mij,jk,mkl->il", weight, arm, x, turns))
-        rest = xp.sqrt(xp.sum((arm @ x @ turns - y) ** 2, axis=(1, 2)))
+        rest = xp.sqrt(xp.sum((arm @ x @ turns - y[None]) ** 2, axis=(1, 2)))
         weight = counted * _weights(rest, counted, _LEAST)
     # Now R_T p + t + R_T R_X w = c is linear in p, the position of X, and in c.
     known = tips.T + xp.einsum("mij,mj->mi", arm @ x, origins)
@@ -55,12 +57,12 @@ def hand_eye(
     for _ in range(_ROUNDS):
         normal = xp.einsum("m,mia,mib->ab", weight, design, design) + 1e-9 * xp.sum(weight) * xp.asarray(np.eye(6))
         solution = solve_positive_definite(normal, -xp.einsum("m,mia,mi->a", weight, design, known))
-        rest = xp.sqrt(xp.sum((design @ solution + known) ** 2, axis=1))
+        rest = xp.sqrt(xp.sum(((design @ solution[:, None])[..., 0] + known) ** 2, axis=1))
         weight = counted * _weights(rest, counted, _LEAST * size)
     return solution[:3], rotation_vector(x), xp.concatenate([rotation_vector(y), solution[3:]])
 
 
-def _weights(rest: Float[AnyArray, " m"], counted: Float[AnyArray, " m"], least: AnyArray) -> Float[AnyArray, " m"]:
+def _weights(rest: Float[AnyArray, " m"], counted: Float[AnyArray, " m"], least: Any) -> Float[AnyArray, " m"]:
     """Of poses by how far they are off: less than 1 beyond three times the median, none beyond nine times."""
     xp = namespace(rest, counted)
     order = xp.sort(xp.where(counted > 0, rest, np.inf))

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ...core.arguments import OneOf
 from ...core.arrays import is_concrete
@@ -90,6 +90,7 @@ class Pixels(AbstractObservation):
         "rotation vector (rad) and origin (mm) of the target in the camera's frame", "1", "pose", "frame",
         default=None, more="for the start; all 0 where an image shows too little; computed from the corners if None",
     )  # fmt: skip
+    images: tuple[str, ...] | None = declared("name of the image", "", "pose", default=None)
     frame = Part("frame of {still}", *FRAME)
     orientation = Part("orientation of {target}", *FRAME[:3])
     optics = Part("intrinsics of {camera}")  # of those that are not exact
@@ -199,6 +200,10 @@ class Pixels(AbstractObservation):
         vars(made).pop("seen", None)
         return made
 
+    @property
+    def places(self) -> Int[np.ndarray, " m"]:
+        return np.zeros(len(self.ids), dtype=int)  # images are no places
+
     def as_corners(self) -> Corners:
         """The corners for a calibration of the camera alone."""
         values, points, u = (np.asarray(values) for values in (self.corners, self.points, self.u))
@@ -272,10 +277,10 @@ class Pixels(AbstractObservation):
         origin, here = unknowns[self.frame][3:], tips.position
         camera, board = (carried, still) if self.on_arm else (still, carried)
         between = origin - here if self.on_arm else here - origin  # from the camera to the target
-        scale = unknowns[self.scale][0] if self.scale in unknowns else 1.0
+        scale = unknowns[self.scale][0] if self.scale in unknowns else None
         flat = xp.moveaxis(self.points, -1, 0)  # (3, m, c)
         turned = xp.einsum("ijm,jmc->imc", xp.broadcast_to(board, (3, 3, m)), flat)
-        arms = turned * (scale if np.ndim(scale) == 0 else scale[None, :, None])
+        arms = turned if scale is None else turned * scale[None, :, None]
         sight = arms + between[:, :, None]
         camera = xp.broadcast_to(camera, (3, 3, m))
         intrinsics = self.whole_intrinsics(unknowns.get(self.optics))[:, :, None]
@@ -299,7 +304,7 @@ class Pixels(AbstractObservation):
         present = xp.asarray(self.seen)
 
         def rows(values: AnyArray) -> AnyArray:  # (..., d, m, c) to (..., r, m); 0 where a corner is absent
-            kept = xp.where(present, values, 0.0)
+            kept = xp.where(present.reshape(*(1,) * (values.ndim - 2), m, c), values, 0.0)
             return xp.moveaxis(kept, (-1, -3, -2), (-3, -2, -1)).reshape(*values.shape[:-3], c * d, m)
 
         variance = (self.u**2).reshape(m, c * d)
@@ -307,7 +312,7 @@ class Pixels(AbstractObservation):
             values=rows(seen.values - xp.moveaxis(self.corners, -1, 0)),
             by_tip=xp.swapaxes(rows(sign * by_shift), 0, 1),
             by_unknowns={name: rows(values) for name, values in by.items()},
-            measured=variance[:, :, None] * xp.asarray(np.eye(c * d)),
+            measured=variance[:, :, None] * xp.asarray(np.eye(c * d))[None],
             by_rotation=xp.swapaxes(rows(by_carried), 0, 1),
         )
 
