@@ -71,7 +71,7 @@ def make(kind, draw, some):
 def pixels(draw, q, some, target):
     """Corners of a flat board, of which some are absent."""
     points = np.tile([[0, 0, 0], [90, 0, 0], [90, 60, 0], [0, 60, 0], [30, 30, 0], [60, 30, 0.0]], (len(q), 1, 1))
-    away = points + [-40.0, -30.0, 400.0] + draw.normal(size=(len(q), 1, 3))
+    away = points + np.array([-40.0, -30.0, 400.0]) + draw.normal(size=(len(q), 1, 3))
     corners = 600 * away[..., :2] / away[..., 2:] + 300 + 0.1 * draw.normal(size=away[..., :2].shape)
     ids = np.tile(np.arange(6), (len(q), 1))
     ids[:, 5] = -1 if some else 5
