@@ -39,6 +39,7 @@ _SIZE = 2.0  # factor within which the size of an arm stays that of the nominal 
 _BY_CHANCE = 0.01  # probability of so much smaller residuals by chance, below which wider bounds are kept
 _PLAIN = "dh"
 _SOME, _FUNCTIONS = "harmonics=1-6", "functions"
+_NOTICED = 1.03  # times the errors of the arm alone in held-out regions, from which a model is not taken
 _WORTH = 10.0  # log evidence that a richer model must add for a still richer one to be tried
 
 
@@ -150,6 +151,7 @@ def with_best_model(record: CalibrationRecord, solve: Solve, recorded: Record, o
         return compare_models(nominal.arm, capture, bounds, models=models, noise=options.noise)
 
     models = [model for model in default_models(nominal.arm, capture) if _FUNCTIONS not in model]
+    ladder: ComparedModels | None = None
     try:
         ladder = options.stage("Comparing models", lambda: compared(models))
         # Models with more functions of each joint take longer, and the next is tried only where the last explains more.
@@ -157,18 +159,24 @@ def with_best_model(record: CalibrationRecord, solve: Solve, recorded: Record, o
             before = max(ladder.models, key=lambda model: model.log_evidence)
             richer = _with_functions(before.model, functions)
             added = options.stage(f"Comparing models ({richer})", lambda model=richer: compared([model]))
-            ladder = ComparedModels((*ladder.models, *added.models))
+            ladder = ladder._replace(models=(*ladder.models, *added.models))
             if added.models[0].log_evidence < before.log_evidence + _WORTH:
                 break
     except (InputError, np.linalg.LinAlgError):  # too few poses to hold some out, or to fit that many functions
-        return record
+        if ladder is None:
+            return record
     chosen, plain = ladder.recommended, ladder.models[0]
-    if chosen.model == _PLAIN or not chosen.result.converged:
+    if chosen.model == _PLAIN or plain.model != _PLAIN or not chosen.result.converged:
         return record
+    # Few regions cannot tell such a model from the best, but whoever asked for none would be served worse.
+    if chosen.rms_outside > _NOTICED * plain.rms_outside:
+        return record
+    better = chosen.rms_outside < plain.rms_outside
     says = (
-        f"Model of the joints: {chosen.model}. It predicts held-out regions to {chosen.rms_outside:.3g} mm RMS, where "
-        f"Denavit-Hartenberg parameters alone predict them to {plain.rms_outside:.3g} mm ({len(ladder.models)} models "
+        f"Model of the joints: {chosen.model}. In held-out regions its errors are {chosen.rms_outside:.3g} mm RMS, "
+        f"those of Denavit-Hartenberg parameters alone {plain.rms_outside:.3g} mm ({len(ladder.models)} models "
         f"compared, {len(chosen.regions)} regions)."
+        + ("" if better else " As these hardly differ, the model that makes the measurements more probable was taken.")
     )
     corrected = chosen.result.space.base
     modelled = recording._replace(nominal=nominal._replace(arm=corrected, prior=default_prior(corrected)))
