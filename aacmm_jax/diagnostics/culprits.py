@@ -50,7 +50,7 @@ _FACTORS = np.geomspace(0.1, 1e4, 32)  # of variances, in units of what they add
 class Culprit(NamedTuple):
     """A cause that explains residuals."""
 
-    kind: str  # "term", "fixed", "pose", "certified", "noisy joint" or "scatter"
+    kind: str  # "term", "fixed", "pose", "certified", "noisy joint", "scatter" or "stated u"
     name: str  # what it concerns
     probability: float  # Bonferroni's: of all causes of its family
     explains: float  # of the excess of the squared residuals

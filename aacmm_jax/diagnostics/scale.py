@@ -19,6 +19,7 @@ from ..core.text import shorten
 from ..core.units import INCH, M
 from ..model.observed import Observed
 from ..uncertainty.shared_kinds import PLACES
+from .arm_size import KEPT, size_of
 from .culprits import culprits_of
 from .equations import EXACT, LEAST_U, PRIOR, Block, Rows, lengths_in_solve, linearisation_of, scale_anchor_of
 from .findings import Case, Finding, chance_text
@@ -38,7 +39,7 @@ _MISTAKEN_UNITS = {
 }
 # A length is named where chi-square falls below a ninth without it, to what chance exceeds in over 5 % of cases.
 _CLEAR, _AGREE = 9.0, 0.05
-_SET_BY = "scale-set-by-fixed-lengths"
+_SET_BY, _FAR_FROM_1 = "scale-set-by-fixed-lengths", "scale-far-from-1"
 _MOST_U = 4.0  # standard uncertainties of k, beyond which what fixes the scale is wrong
 _FEW = 2  # lengths, of which each may be the wrong one where they disagree
 
@@ -56,10 +57,12 @@ class Lengths(NamedTuple):
 
 
 def test(case: Case) -> list[Finding]:
-    """Lengths that disagree, at most one finding on k, and one where the arm could not be divided by it."""
+    """Lengths that disagree, at most one finding on the scale, and one where the arm could not be divided by k."""
     record = case.record
     fits = record.plausible_scale and not record.implausible_residual
     of_lengths, of_k = _of_lengths(case) if fits else None, _of_k(record)
+    if fits and (of_k is None or of_k.code == _FAR_FROM_1):
+        of_k = _of_size(record) or of_k
     if (
         of_lengths is not None
         and of_k is not None
@@ -124,12 +127,34 @@ def _of_k(record: CalibrationRecord) -> Finding | None:
         )
     if record.hold is not None and abs(k - 1) > max(_SUSPICIOUS, 3 * record.u_k):
         return Finding(
-            "scale-far-from-1",
+            _FAR_FROM_1,
             f"The scale factor k = {k:.5f} is far from 1.",
             advice=f"Is the nominal value of {record.hold} right, and is each reference length right?",
             concerns=(record.hold,),
         )
     return None
+
+
+def _of_size(record: CalibrationRecord) -> Finding | None:
+    """All lengths of the arm together too long or too short, as no maker leaves them."""
+    size = size_of(record)
+    if size is None or size.probability >= LEVEL or record.scale_set_by:
+        return None
+    capture = record.recording.capture
+    names = [o.name for o in capture.observations if o.fixes_scale]
+    source = f"the instrument or artefact ({shorten(names, 3)})" if names else "the lengths (all reference lengths)"
+    return Finding(
+        _FAR_FROM_1,
+        f"All lengths of the calibrated arm are {100 * abs(size.factor):.2g} % (u = {100 * size.u:.1g} %) "
+        f"{'longer' if size.factor > 0 else 'shorter'} than nominal, where a maker keeps {100 * KEPT:g} %: most likely "
+        f"the scale of {source} is wrong.",
+        "Every length that the arm measures is wrong by as much, and U does not contain it.",
+        "Check its unit, certificate and temperature, and the nominal lengths of the arm.",
+        severity="doubt",
+        doubt=f"the scale seems wrong by {100 * abs(size.factor):.2g} %",
+        probability=size.probability,
+        concerns=tuple(names) or tuple(f"{length.start} - {length.end}" for length in capture.lengths),
+    )
 
 
 def _of_lengths(case: Case) -> Finding | None:

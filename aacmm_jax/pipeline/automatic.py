@@ -19,8 +19,11 @@ from ..core.units import DEG
 from ..data.capture import Capture
 from ..data.recording import Recording
 from ..diagnostics.capture_check import search_couplings
+from ..diagnostics.causes import term_text
 from ..diagnostics.contradictions import remove_contradicting
+from ..diagnostics.culprits import missing
 from ..diagnostics.equations import EXACT
+from ..diagnostics.findings import case_of
 from ..diagnostics.reading_check import coupling_words
 from ..diagnostics.usability import on_bounds
 from ..kinematics.arm import correction_names, is_length, without_corrections
@@ -159,8 +162,10 @@ def with_best_model(record: CalibrationRecord, recorded: Record, options: Any) -
     chosen, plain = ladder.recommended, ladder.models[0]
     if chosen.model == _PLAIN or not chosen.result.converged:
         return record
+    terms = [term_text(term) for term in missing(case_of(record)) if term.joint is not None]
+    follow = f" Without it, residuals follow {shorten(terms, 3)}." if terms else ""
     says = (
-        f"Model of the joints: {chosen.model}. It predicts held-out regions to {chosen.rms_outside:.3g} mm RMS, where "
+        f"Model of the joints: {chosen.model}.{follow} It predicts held-out regions to {chosen.rms_outside:.3g} mm RMS, where "
         f"Denavit-Hartenberg parameters alone predict them to {plain.rms_outside:.3g} mm ({len(ladder.models)} models "
         f"compared, {len(chosen.regions)} regions)."
     )
