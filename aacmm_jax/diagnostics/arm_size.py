@@ -57,3 +57,12 @@ def size_of(record: CalibrationRecord) -> Size | None:
     _, factor, u = best
     beyond = max(abs(factor) - KEPT, 0.0) / u
     return Size(factor, u, float(student_tail(np.array([beyond]), np.array([len(number) - 1.0]))[0]))
+
+
+def u_of_size(record: CalibrationRecord) -> float:
+    """Relative standard uncertainty with which a calibration knows all lengths of the arm together."""
+    number = [i for i, name in enumerate(record.names) if is_length(name)]
+    lengths = np.array([float(value_of(record.calibrated.arm, record.names[i])) for i in number])
+    square = float(lengths @ lengths)
+    variance = float(lengths @ np.asarray(record.covariance)[np.ix_(number, number)] @ lengths)
+    return float(np.sqrt(max(variance, 0.0))) / square if square else 0.0

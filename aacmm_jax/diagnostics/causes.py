@@ -13,6 +13,7 @@ from .findings import Case, Finding, chance_text, rounded
 from .missing_terms import FoundTerm, wider_model
 
 ORDER, NEEDS = 60, "fit"
+_SEVERAL = 3  # steps at different poses, from which they are no single events
 
 
 def test(case: Case) -> list[Finding]:
@@ -42,7 +43,12 @@ def term_text(term: FoundTerm) -> str:
 
 def _of_terms(case: Case, terms: Sequence[FoundTerm], explains: float) -> Finding:
     """Terms that the model lacks, in one finding: each explains what those before it leave."""
+    events = [term for term in terms if term.term.first >= 0]
     texts = [term_text(term) for term in terms]
+    if len(events) >= _SEVERAL:
+        # Of one event, all is said; of several, what they have in common: that something was not firm.
+        texts = [term_text(term) for term in terms if term.term.first < 0]
+        texts.append(f"{len(events)} changes from one pose to the next, first {term_text(events[0])}")
     named = {term.term.follows for term in terms}
     likely = [text for text in dict.fromkeys(other.follows for term in terms for other in term.others)]
     likely = [text for text in likely if text not in named]

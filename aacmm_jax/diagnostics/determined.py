@@ -52,7 +52,9 @@ def test(case: Case) -> list[Finding]:
     traded = {name for trade_off in seen.trade_offs for name in trade_off.names}
     # Without an anchor all lengths slide to bounds in stage 1, which the scale fix undoes.
     sides = on_bounds(record, final=True) | (on_bounds(record) if is_anchored(record) else {})
-    findings = [_many(case, sides)] if many_on_bounds(record) and len(sides.keys() - traded) >= len(record.names) / 3 else []
+    findings = (
+        [_many(case, sides)] if many_on_bounds(record) and len(sides.keys() - traded) >= len(record.names) / 3 else []
+    )
     for code, (says, costs, advice) in _ON_BOUNDS.items() if not findings else ():
         names = [name for name in sides if (name in traded) == (code == "weak-on-bounds")]
         if not names:
@@ -62,7 +64,8 @@ def test(case: Case) -> list[Finding]:
         says = says.format(names=shorten([f"{name} ({sides[name]})" for name in names]))
         doubt = f"on a bound: {shorten(names, 3)}"
         finding = Finding(code, says, costs, advice, "doubt", doubt, concerns=tuple(names))
-        findings.append(finding._replace(explains=effect.share or None))
+        # Where a fixed length sets another scale than the lengths, that is what takes the others to their bounds.
+        findings.append(finding._replace(explains=None if record.scale_set_by else effect.share or None))
     findings += [*_redundancy(record), *(Finding("undetermined", sentence) for sentence in seen.sentences())]
     # Named above are those that the same capture could not determine without noise either, and near-degenerate ones.
     open_parts = np.flatnonzero(np.abs(seen.null).max(axis=1, initial=0.0) > _TOGETHER)

@@ -11,7 +11,7 @@ import numpy as np
 from ..core.text import shorten
 from ..data.observations.observation import stated_u
 from .findings import Case, Finding
-from .residual_tests import LEVEL, form_test
+from .residual_tests import SURE, form_test
 from .scale import lengths_of
 
 ORDER, NEEDS = 61, "fit"
@@ -48,7 +48,7 @@ def _of_instruments(case: Case) -> list[tuple[str, float]]:
         sizes = [part.residual.shape if part.name == name else None for part in rows]
         kernels = [None if size is None else np.broadcast_to(np.eye(size[1]), (*size, size[1])) for size in sizes]
         form = form_test(case.left, kernels, relative=False)
-        if (1 - form.probability) * len(measured) < LEVEL and form.ratio * _CLEAR**2 < 1:
+        if (1 - form.probability) * len(measured) < SURE and form.ratio * _CLEAR**2 < 1:
             found.append((name, float(np.sqrt(max(form.ratio, 1e-12)))))
     return found
 
@@ -56,9 +56,9 @@ def _of_instruments(case: Case) -> list[tuple[str, float]]:
 def _of_certified(case: Case) -> list[tuple[str, float]]:
     """The same of reference lengths and certified values, which the poses compare with each other."""
     lengths = case.once(lengths_of) if case.scatters else None
-    if lengths is None or (1 - lengths.probability) >= LEVEL or lengths.birge_ratio * _CLEAR > 1:
+    if lengths is None or lengths.smaller >= SURE or lengths.by_u * _CLEAR > 1:
         return []
     capture = case.record.recording.capture
     names = ["reference lengths"] if capture.lengths else []
     names += [o.name for o in capture.observations if o.certified]
-    return [(shorten(list(dict.fromkeys(names)), 3), max(lengths.birge_ratio, 1e-6))]
+    return [(shorten(list(dict.fromkeys(names)), 3), max(lengths.by_u, 1e-6))]

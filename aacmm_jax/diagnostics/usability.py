@@ -21,7 +21,7 @@ from .noisy_encoders import noisiest_joint
 from .pose_residuals import distances_of
 from .reading_check import coupling_words, explanation_words
 from .recorded import likely_cause
-from .residual_tests import LEVEL
+from .residual_tests import SURE
 
 ORDER, NEEDS = 10, "nothing"
 _APART = 5.0  # RMS of a session among others, over that which it has alone, beyond which they are not of one arm
@@ -108,7 +108,7 @@ def likely_reason(case: Case) -> str:
         # What equations linear in the residuals tell, which must be small for that.
         noisiest = case.once(noisiest_joint)
         joints = [encoder.joint for encoder in record.noisy_encoders]
-        joints += [noisiest.joint] if noisiest is not None and noisiest.probability < LEVEL else []
+        joints += [noisiest.joint] if noisiest is not None and noisiest.probability < SURE else []
         if joints:
             return f"play or a loose encoder in joint {joints[0]}"
         bending = [str(term.joint) for term in case.once(missing) if term.kind == "gravity"]

@@ -133,7 +133,7 @@ def run(kind: str | None, case: str, size: float, seed: int = 1) -> dict[str, An
     decisions = [] if record is None else [*record.decisions, *map(_left_out, record.removed)]
     over = math.nan if record is None else beyond_u(trial, record)
     return {
-        "severity": findings[0].severity if findings else "",
+        "severity": next((s for s in ("unusable", "doubt", "note") if s in {f.severity for f in findings}), ""),
         "over_u": round(over, 3) if math.isfinite(over) else None,
         "findings": texts,
         "decisions": decisions,
