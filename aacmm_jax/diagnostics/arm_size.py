@@ -1,5 +1,6 @@
-"""By which factor the lengths of a calibrated arm differ from nominal: an instrument, artefact or reference length whose
-scale is wrong leaves no residual, but all lengths of the arm follow it.
+"""By which factor the lengths of a calibrated arm differ from nominal.
+
+An instrument, artefact or reference length whose scale is wrong leaves no residual, but all lengths of the arm follow.
 
 With the free lengths x, of covariance C by the calibration, and their nominal values n, x - n = f n + d: the deviations
 d that manufacture leaves are independent, with a variance that restricted maximum likelihood estimates with the factor

@@ -52,9 +52,8 @@ def test(case: Case) -> list[Finding]:
     traded = {name for trade_off in seen.trade_offs for name in trade_off.names}
     # Without an anchor all lengths slide to bounds in stage 1, which the scale fix undoes.
     sides = on_bounds(record, final=True) | (on_bounds(record) if is_anchored(record) else {})
-    findings = (
-        [_many(case, sides)] if many_on_bounds(record) and len(sides.keys() - traded) >= len(record.names) / 3 else []
-    )
+    many = many_on_bounds(record) and len(sides.keys() - traded) >= len(record.names) / 3
+    findings = [_many(case, sides)] if many else []
     for code, (says, costs, advice) in _ON_BOUNDS.items() if not findings else ():
         names = [name for name in sides if (name in traded) == (code == "weak-on-bounds")]
         if not names:

@@ -309,7 +309,7 @@ def equations_of(record: CalibrationRecord) -> Equations:
 
 
 def _root_of(covariance: Float[np.ndarray, "m r r"]) -> Float[np.ndarray, "m r r"]:
-    """A matrix R with R R' the covariance, which may be singular; rows keep their units where these do not correlate."""
+    """A matrix R with R R' the covariance, which may be singular; each column is of the unit of its row."""
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[:, :, None]
     safe = np.where(sd > 0, sd, 1.0)
     values, vectors = np.linalg.eigh(covariance / safe / safe.swapaxes(1, 2))

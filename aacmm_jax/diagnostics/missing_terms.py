@@ -3,8 +3,8 @@
 Of joint i, the model's angle is its reading and a zero. What it lacks is a further function phi of the readings, whose
 column is that of theta_i times phi: those of `kinematics.corrections` (harmonics of an eccentric, tilted or oval
 encoder, a wrong gear ratio, the moment of gravity about the axis where the joint or the link behind it bends), and a
-zero that drifts from pose to pose, evenly or until it has settled. A base that moves and an arm that grows, meanwhile or
-with its temperature, move the tip itself.
+zero that drifts from pose to pose, evenly or until it has settled. A base that moves and an arm that grows, meanwhile
+or with its temperature, move the tip itself.
 """
 
 from collections.abc import Sequence

@@ -110,8 +110,8 @@ def of_certified(case: Case) -> list[Cause]:
 
 
 def of_variances(case: Case, rows: Sequence[Rows]) -> list[Cause]:
-    """One encoder, or one socket or observation, that is noisier; the seat, beside the encoders; and what was measured in
-    rad or px, beside what was measured in mm."""
+    """One encoder, or one socket or observation, that is noisier; the seat, beside the encoders; and what was measured
+    in rad or px, beside what was measured in mm."""
 
     def of_joint(joint: int) -> Callable[[Rows], np.ndarray]:
         return lambda part: part.extra[..., [joint]]

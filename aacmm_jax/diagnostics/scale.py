@@ -146,18 +146,19 @@ def _of_size(record: CalibrationRecord) -> Finding | None:
         return None
     capture = record.recording.capture
     names = [o.name for o in capture.observations if o.fixes_scale]
-    source = f"the instrument or artefact ({shorten(names, 3)})" if names else "the lengths (all reference lengths)"
+    lengths = [f"{length.start} - {length.end}" for length in capture.lengths]
+    source = f"instrument or artefact ({shorten(names, 3)})" if names else f"lengths ({shorten(lengths, 3)})"
     return Finding(
         _FAR_FROM_1,
         f"All lengths of the calibrated arm are {100 * abs(size.factor):.2g} % (u = {100 * size.u:.1g} %) "
         f"{'longer' if size.factor > 0 else 'shorter'} than nominal, where a maker keeps {100 * KEPT:g} %: most likely "
-        f"the scale of {source} is wrong.",
+        f"the scale of the {source} is wrong.",
         "Every length that the arm measures is wrong by as much, and U does not contain it.",
         "Check its unit, certificate and temperature, and the nominal lengths of the arm.",
         severity="doubt",
         doubt=f"the scale seems wrong by {100 * abs(size.factor):.2g} %",
         probability=size.probability,
-        concerns=tuple(names) or tuple(f"{length.start} - {length.end}" for length in capture.lengths),
+        concerns=tuple(names or lengths),
     )
 
 

@@ -177,9 +177,9 @@ def with_best_model(record: CalibrationRecord, recorded: Record, options: Any) -
     terms = [term_text(term) for term in found if term.kind in all_sought() or term.term.correction is not None]
     follow = f" Without it, residuals follow {shorten(terms, 3)}." if terms else ""
     says = (
-        f"Model of the joints: {chosen.model}.{follow} It predicts held-out regions to {chosen.rms_outside:.3g} mm RMS, where "
-        f"Denavit-Hartenberg parameters alone predict them to {plain.rms_outside:.3g} mm ({len(ladder.models)} models "
-        f"compared, {len(chosen.regions)} regions)."
+        f"Model of the joints: {chosen.model}.{follow} It predicts held-out regions to {chosen.rms_outside:.3g} mm "
+        f"RMS, where Denavit-Hartenberg parameters alone predict them to {plain.rms_outside:.3g} mm "
+        f"({len(ladder.models)} models compared, {len(chosen.regions)} regions)."
     )
     corrected = chosen.result.space.base
     modelled = recording._replace(nominal=nominal._replace(arm=corrected, prior=default_prior(corrected)))
