@@ -17,10 +17,18 @@ from ..data.capture import join_sessions
 from ..data.noise import Noise
 from ..data.recording import Recording
 from ..diagnostics.findings import case_of
+from ..diagnostics.mistakes import mistake_in_data
 from ..kinematics.corrected_arm import with_corrections
 from ..kinematics.priors import Prior, default_prior
 from ..model.loss_names import LossName
-from .automatic import with_best_model, with_full_couplings, with_wider_bounds, without_contradicting
+from .automatic import (
+    matches,
+    with_best_model,
+    with_full_couplings,
+    with_wider_bounds,
+    without_contradicting,
+    without_misplaced,
+)
 from .cross_validation import can_cross_validate, cross_validate
 from .data_corrections import corrected_capture, with_corrected_readings, with_prior_of_few
 from .hold_out import held_out_poses, tested, without_held_out
@@ -91,10 +99,11 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         monte_carlo: check the uncertainties by Monte Carlo.
         strict: raise `InputError` where such data could not determine free parameters even without noise.
         remove_contradicting: leave out groups that contradict all others.
-        automatic: give too few data the prior and the noise of a real arm, correct readings that do not match the arm
-            where one order, signs, zeros or unit explain them, find joints that move with others, widen default bounds
-            that the fit reaches, leave out what contradicts the rest, and compare models of the joints unless a model,
-            a prior, a method or a robust loss is stated. ``decisions`` of the record says what was done and why.
+        automatic: give too few data the prior and the noise of a real arm, leave out poses that were mixed up, correct
+            readings that do not match the arm where one order, signs, zeros or unit explain them, find joints that move
+            with others, widen default bounds that the fit reaches, leave out what contradicts the rest, and compare
+            models of the joints unless a model, a prior, a method or a robust loss is stated. ``decisions`` of the
+            record says what was done and why.
         max_steps: most evaluations of each solve.
         stage: called with what is done next, in words, and a function that does it, such as to show progress.
 
@@ -143,16 +152,22 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         record = chosen.stage("Calibrating", lambda: recorded(solved(recording), recording))
         record = record._replace(decisions=decided)
         if automatic:
+            record = chosen.stage("Checking poses", lambda: without_misplaced(record, solved, recorded))
             # First, as a search of seconds; that of orders, signs and zeros takes ten times as long.
             further = chosen.model is None and nominal.arm.corrections is None
             record = chosen.stage("Checking couplings", lambda: with_full_couplings(record, solved, recorded, further))
             check = lambda: with_corrected_readings(record, solved, recorded)  # noqa: E731
             record, explanation = chosen.stage("Checking readings", check)
             capture = capture if explanation is None else corrected_capture(capture, explanation) or capture
+        # Where a mistake in the recording remains, every other remedy would only make up for it.
+        mistake = None if not automatic or matches(record) else case_of(record).once(mistake_in_data)
+        sound = mistake is None or mistake.of_bounds
+        if automatic and sound:
             record = chosen.stage("Checking bounds", lambda: with_wider_bounds(record, solved, recorded))
-        if chosen.remove_contradicting or (automatic and chosen.robust is None):  # which bad poses do not move
+        if sound and (chosen.remove_contradicting or (automatic and chosen.robust is None)):
+            # Bad poses do not move a robust fit.
             record = chosen.stage("Comparing groups", lambda: without_contradicting(record, solved, recorded))
-        if automatic and all(value is None for value in stated):
+        if automatic and sound and all(value is None for value in stated):
             record = with_best_model(record, recorded, chosen)
         if masks:
             record = chosen.stage("Testing held-out poses", lambda: tested(record, capture, masks))

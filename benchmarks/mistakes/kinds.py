@@ -92,9 +92,11 @@ def _a_pose(trial: Trial) -> int:
 
 
 def pose_name(trial: Trial, row: int) -> str:
-    """A pose as findings name it: its socket or observation, and its number there."""
-    names = [label.partition("/")[0] for label in trial.label]
-    return f"{names[row]} pose {names[: row + 1].count(names[row])}"
+    """A pose as findings name it: its socket or observation, and its number there, hole after hole."""
+    owner = trial.label[row].partition("/")[0]
+    rows = [i for i, label in enumerate(trial.label) if label.partition("/")[0] == owner]
+    holes = list(dict.fromkeys(trial.label[rows]))
+    return f"{owner} pose {sorted(rows, key=lambda i: holes.index(trial.label[i])).index(row) + 1}"
 
 
 def growth(trial: Trial, size: float) -> None:
