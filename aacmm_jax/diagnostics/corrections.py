@@ -33,6 +33,7 @@ _NOMINAL = 0.005  # of the arm's size: a smaller residual is what a nominal arm 
 _POSES, _OBSERVATIONS = 60, 24  # of which as many as these are looked at
 _TURN = 2 * np.pi * 1.02  # rad; readings of few joints go further
 _ROUNDS, _ROUNDS_FREE = 4, 12  # Gauss-Newton steps of the geometry, and with a zero that is far off
+_ADJUSTED = 2.0  # the factor by which a zero that was adjusted must be better than another correction
 _STARTS = 8  # zeros that are tried over a full turn
 _LATE = 3  # most rows by which readings are late or early
 UNITS = {
@@ -89,6 +90,7 @@ def likely_cause(arm: Arm, capture: Capture) -> Mistake | None:
     # One that concerns only some of the observations is part of another that is as good.
     alike = [other.cause for _, other in others if not set(other.concerns) & set(best.concerns)]
     also = f" Equally likely: {shorten(alike, 3)}." if alike else ""
+    rms /= _ADJUSTED if best.zero else 1.0
     reduced = f"Correcting this reduces the residuals (nominal arm) from {given:.3g} to {rms:.3g} mm RMS."
     return Mistake(f"Likely cause: {best.cause}. {reduced}{best.line}{also}", best.concerns, best.of_readings)
 
@@ -107,14 +109,15 @@ def _rms(arm: Arm, observed: Observed) -> float:
 
 
 def _with_zero(arm: Arm, correction: _Correction) -> tuple[float, float]:
-    """The same with the zero of a joint that fits best, over a full turn; and the change of this zero, rad."""
+    """The same with the zero of a joint that fits best, over a full turn, which counts more as it was adjusted; and the
+    change of this zero, rad."""
     joint, best = int(correction.zero.rpartition("_")[2]) - 1, (np.inf, 0.0)
     nominal = np.asarray(arm.theta)
     for turn in np.arange(1, _STARTS) * (2 * np.pi / _STARTS):
         start = to_numpy(arm.replace(theta=nominal + turn * (np.arange(len(nominal)) == joint)))
         rms, zero = _fitted(start, correction.observed, correction.zero)
         best = min(best, (rms, float(np.remainder(zero - nominal[joint] + np.pi, 2 * np.pi) - np.pi)))
-    return best
+    return _ADJUSTED * best[0], best[1]
 
 
 def _fitted(arm: Arm, observed: Observed, free: str) -> tuple[float, float]:

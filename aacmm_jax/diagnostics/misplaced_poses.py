@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from ..core.text import listed, pluralise
 from ..core.units import DEG
@@ -37,6 +37,11 @@ class Misplaced(NamedTuple):
     distance: float  # of the farthest of them from where it is expected, mm
     groups: tuple[str, ...] = ()  # sockets or observations that the mistake is about
 
+    @property
+    def concerns(self) -> tuple[str, ...]:
+        """What is wrong, first: the pose, or the groups to which several belong."""
+        return (*self.names, *self.groups) if len(self.names) == 1 else (*self.groups, *self.names)
+
 
 def misplaced_poses(fit: RoughFit, capture: Capture) -> list[Misplaced]:
     """The mistakes that explain which poses of a capture are wrong in its rough fit, the largest first."""
@@ -53,25 +58,26 @@ class _Search:
         self.row = np.concatenate([np.arange(size) for size in sizes])
         self.q = np.concatenate([np.asarray(observation.q) for observation in fit.observations])
         self.away = np.concatenate([fit.distances(observation) for observation in fit.observations])
-        self.wrong = np.flatnonzero(self.away > fit.limit)
+        self.wrong: list[int] = np.flatnonzero(self.away > fit.limit).tolist()
 
     def run(self) -> list[Misplaced]:
-        left, mistakes = self.wrong, []
+        left, mistakes = self.wrong, list[Misplaced]()
         for explain in (self._late, self._exchanged_places, self._exchanged_readings, self._elsewhere, self._joint):
-            mistakes += explain(left) if len(left) else []
-            left = np.setdiff1d(left, [pose for mistake in mistakes for pose in mistake.poses])
+            mistakes += explain(left) if left else []
+            explained = {pose for mistake in mistakes for pose in mistake.poses}
+            left = [pose for pose in left if pose not in explained]
         return sorted(mistakes, key=lambda mistake: -len(mistake.poses))
 
-    def _mistake(self, poses: Sequence[int] | np.ndarray, says: str, groups: Sequence[str] = ()) -> Misplaced:
-        names, away = tuple(self.names[pose] for pose in poses), float(self.away[np.asarray(poses)].max())
-        return Misplaced(tuple(int(pose) for pose in poses), names, says, away, tuple(dict.fromkeys(groups)))
+    def _mistake(self, poses: Sequence[int], says: str, groups: Sequence[str] = ()) -> Misplaced:
+        names, away = tuple(self.names[pose] for pose in poses), float(self.away[list(poses)].max())
+        return Misplaced(tuple(poses), names, says, away, tuple(dict.fromkeys(groups)))
 
     def _with_readings(self, pose: int, q: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " k"]:
         """Distances of one pose with each of several readings."""
-        observation = self.fit.observations[self.owner[pose]].select([self.row[pose]] * len(q))
+        observation = self.fit.observations[self.owner[pose]].select(np.full(len(q), self.row[pose]))
         return self.fit.distances(observation.changed(q=q))
 
-    def _late(self, wrong: Int[np.ndarray, " w"]) -> list[Misplaced]:
+    def _late(self, wrong: list[int]) -> list[Misplaced]:
         """All readings some rows late or early, also over the borders of sockets and files."""
         if len(wrong) < 2:  # a single one is as well explained otherwise
             return []
@@ -80,16 +86,16 @@ class _Search:
             pairs = [(pose, pose + rows) for pose in wrong] + [(pose - rows, pose) for pose in wrong]
             pairs = [(pose, at) for pose, at in pairs if min(pose, at) >= 0 and max(pose, at) < len(self.q)]
             apart = np.array([self._with_readings(pose, self.q[[at]])[0] for pose, at in pairs])
-            if len(pairs) > len(wrong) and np.all(apart <= self.fit.limit):
+            if len(pairs) > len(wrong) and np.all(apart <= self.fit.near):
                 side, other = ("late", "next") if rows > 0 else ("early", "previous")
                 which = f"the {other} row" if abs(rows) == 1 else f"{abs(rows)} rows further"
                 says = f"the readings are {pluralise(abs(rows), 'row')} {side}: these poses fit with those of {which}"
                 return [self._mistake(wrong, says)]
         return []
 
-    def _places(self, wrong: Int[np.ndarray, " w"]) -> dict[int, Place]:
+    def _places(self, wrong: list[int]) -> dict[int, Place]:
         """Where each wrong pose fits: the closest other socket, observation or point."""
-        closest, places = dict.fromkeys(wrong.tolist(), self.fit.limit), {}
+        closest, places = dict.fromkeys(wrong, self.fit.near), {}
         for other in self.fit.observations:
             labels = [entry.name for entry in other.entries if entry.of_poses and entry.content == "text"]
             fields = [name for name in other.by_pose if name not in labels]
@@ -99,7 +105,7 @@ class _Search:
             pairs = [(self.fit.observations[self.owner[pose]], self.row[pose]) for pose in poses]
             rows = {name: np.stack([np.asarray(getattr(part, name))[row] for part, row in pairs]) for name in fields}
             for first in np.unique(other.places, return_index=True)[1]:
-                moved = other.select([first] * len(poses)).changed(**rows)
+                moved = other.select(np.full(len(poses), first)).changed(**rows)
                 place = other.name, " ".join(getattr(other, label)[first] for label in labels)
                 for pose, distance in zip(poses, self.fit.distances(moved), strict=True):
                     if distance < closest[pose]:
@@ -116,14 +122,14 @@ class _Search:
         labels = [entry.name for entry in own.entries if entry.of_poses and entry.content == "text"]
         return own.name, " ".join(getattr(own, label)[row] for label in labels)
 
-    def _by_place(self, wrong: Int[np.ndarray, " w"]) -> dict[tuple[Place, Place], list[int]]:
+    def _by_place(self, wrong: list[int]) -> dict[tuple[Place, Place], list[int]]:
         """Wrong poses by where they were recorded and where they fit."""
         grouped: dict[tuple[Place, Place], list[int]] = {}
         for pose, place in self._places(wrong).items():
             grouped.setdefault((self._own_place(pose), place), []).append(pose)
         return grouped
 
-    def _exchanged_places(self, wrong: Int[np.ndarray, " w"]) -> list[Misplaced]:
+    def _exchanged_places(self, wrong: list[int]) -> list[Misplaced]:
         """Two sockets, observations or points under each other's name."""
         grouped, mistakes = self._by_place(wrong), []
         for (own, place), poses in grouped.items():
@@ -133,10 +139,10 @@ class _Search:
                 mistakes.append(self._mistake([*poses, *back], says, (own[0], place[0])))
         return mistakes
 
-    def _exchanged_readings(self, wrong: Int[np.ndarray, " w"]) -> list[Misplaced]:
+    def _exchanged_readings(self, wrong: list[int]) -> list[Misplaced]:
         """Pairs of poses that fit with each other's readings."""
         wrong, mistakes = wrong[:_MOST_WRONG], []
-        fits = np.array([self._with_readings(pose, self.q[wrong]) <= self.fit.limit for pose in wrong])
+        fits = np.array([self._with_readings(pose, self.q[wrong]) <= self.fit.near for pose in wrong])
         left = np.ones(len(wrong), dtype=bool)
         for i, j in zip(*np.nonzero(np.triu(fits & fits.T, 1)), strict=True):
             if left[i] and left[j]:
@@ -146,14 +152,14 @@ class _Search:
                 mistakes.append(self._mistake([wrong[i], wrong[j]], says))
         return mistakes
 
-    def _elsewhere(self, wrong: Int[np.ndarray, " w"]) -> list[Misplaced]:
+    def _elsewhere(self, wrong: list[int]) -> list[Misplaced]:
         """Poses under the name of another socket, observation or point."""
         return [
             self._mistake(poses, f"recorded under {_words(own)}, but {_words(place)} fits", (own[0], place[0]))
             for (own, place), poses in self._by_place(wrong).items()
         ]
 
-    def _joint(self, wrong: Int[np.ndarray, " w"]) -> list[Misplaced]:
+    def _joint(self, wrong: list[int]) -> list[Misplaced]:
         """Single poses, with the reading that alone explains why they are far off, if there is one."""
         return [self._mistake([pose], self._off(pose)) for pose in wrong]
 
@@ -172,7 +178,7 @@ class _Search:
                 turns = turns[best] + step * np.array([-1.0, 0.0, 1.0])
         (joint, (distance, turn)), *others = sorted(least.items(), key=lambda item: item[1][0])
         says = f"{self.away[pose]:.2g} mm off"
-        if distance > self.fit.limit or any(_APART * distance > other for _, (other, _) in others):
+        if distance > self.fit.near or any(_APART * distance > other for _, (other, _) in others):
             return says
         return f"{says}, as if the reading of joint {joint + 1} were wrong by {-turn / DEG:.2g} deg"
 

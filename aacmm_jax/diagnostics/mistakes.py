@@ -15,11 +15,11 @@ from ..core.text import shorten
 from ..core.units import DEG
 from ..data.capture import Capture, draw_poses
 from ..data.observations.held import position_of
-from ..data.recording import Recording
 from ..kinematics.arm import is_length, value_of
 from ..kinematics.parameters import ArmSpecification
 from .capture_check import check_capture
 from .corrections import UNITS, Mistake, likely_cause
+from .equations import PROBE
 from .findings import Case, by_equations
 from .misplaced_poses import Misplaced, misplaced_poses
 from .reading_check import ReadingCheck, coupling_words, explanation_words
@@ -28,8 +28,8 @@ from .rough_fit import RoughFit, rough_fit
 TRY_ALL = "aacmm arm ARM --check MANIFEST tries every order and sign of the columns, and zero offsets of the joints."
 _CHECKED = 150  # poses, drawn at random: more only take longer
 _BETTER = 2.0  # the factor by which other readings must reduce the residual to be believed
+_MAINLY = 3.0  # the factor by which the offset of the tip must exceed changes of other lengths to be the cause
 _CLOSE = 0.02  # of a length: what the parameters of a real arm can change it by
-_PROBE = ("probe_x", "probe_y", "probe_z")
 
 
 @by_equations
@@ -48,7 +48,17 @@ def misplaced(case: Case) -> list[Misplaced]:
 @by_equations
 def single_mistake(case: Case) -> Mistake | None:
     """The one mistake that explains why data do not match the arm, where it is found without a long search."""
-    return mistake_in(case.record.recording, case.once(fitted_roughly), case.once(misplaced))
+    record, fit, wrong = case.record, case.once(fitted_roughly), case.once(misplaced)
+    nominal, capture = record.recording.nominal, record.recording.capture
+    if fit is None:
+        return likely_cause(nominal.arm, capture)
+    if wrong:
+        first, *others = wrong
+        also = f"; {shorten([f'{shorten(w.names, 3)}: {w.says}' for w in others], 2)}" if others else ""
+        concerns = dict.fromkeys(name for mistake in wrong for name in mistake.concerns)
+        return Mistake(f"Likely cause: {shorten(first.names, 3)}: {first.says}{also}.", tuple(concerns))
+    far = _far_from_stated(fit, nominal) if fit.rms * _BETTER < record.residual else None
+    return _of_lengths(fit, capture) or far
 
 
 @by_equations
@@ -57,24 +67,6 @@ def mistake_in_data(case: Case) -> Mistake | None:
     if case.once(fitted_roughly) is not None:
         return case.once(single_mistake)
     return case.once(single_mistake) or _of_check(case)
-
-
-def mistake_in(recording: Recording, fit: RoughFit | None, wrong: list[Misplaced]) -> Mistake | None:
-    """A mistake of a recording, with its rough fit and the poses that are wrong in it."""
-    nominal, capture = recording.nominal, recording.capture
-    if fit is None:
-        return likely_cause(nominal.arm, capture)
-    if wrong:
-        first, *others = wrong
-        also = f"; {shorten([f'{shorten(w.names, 3)}: {w.says}' for w in others], 2)}" if others else ""
-        return Mistake(f"Likely cause: {shorten(first.names, 3)}: {first.says}{also}.", wrong_names(wrong))
-    return _of_lengths(fit, capture) or _far_from_stated(fit, nominal)
-
-
-def wrong_names(wrong: list[Misplaced]) -> tuple[str, ...]:
-    """The poses that are wrong, and the sockets and observations that are concerned."""
-    names = [name for mistake in wrong for name in (*mistake.names, *mistake.groups)]
-    return tuple(dict.fromkeys(names))
 
 
 def _of_check(case: Case) -> Mistake | None:
@@ -128,21 +120,26 @@ def _of_lengths(fit: RoughFit, capture: Capture) -> Mistake | None:
 
 
 def beyond_bounds(fit: RoughFit, nominal: ArmSpecification) -> dict[str, float]:
-    """Parameters that a rough fit changes by more than their bounds allow, and by how much, mm or rad."""
+    """Parameters that a rough fit changes by more than their bounds allow, or those of lengths where the probe is
+    fixed, and by how much, mm or rad."""
     bounds = nominal.bounds()
     half = dict(zip(bounds.space.names, (np.asarray(bounds.upper) - np.asarray(bounds.lower)) / 2, strict=True))
     change = {name: float(value_of(fit.arm, name)) - float(value_of(bounds.space.base, name)) for name in fit.names}
-    return {name: value for name, value in change.items() if abs(value) > half[name]}
+    return {name: value for name, value in change.items() if abs(value) > half.get(name, nominal.length)}
 
 
 def _far_from_stated(fit: RoughFit, nominal: ArmSpecification) -> Mistake | None:
     """Parameters that are farther from the arm's file than their bounds allow."""
-    far = beyond_bounds(fit, nominal)
+    far, free = beyond_bounds(fit, nominal), nominal.space().names
     if not far:
         return None
     texts = [f"{name} by {v:.3g} mm" if is_length(name) else f"{name} by {v / DEG:.3g} deg" for name, v in far.items()]
     differs = "the arm differs from what is stated in its file by more than the bounds allow"
-    if set(far) & set(_PROBE):
-        offset = np.asarray(fit.arm.probe) - np.asarray(nominal.arm.probe)
-        differs = f"the tip of the probe is {np.linalg.norm(offset):.0f} mm from where it is stated in the arm's file"
-    return Mistake(f"Likely cause: {differs} ({shorten(texts, 4)}).", tuple(far), of_bounds=True)
+    tip, offset = np.asarray(fit.arm.probe), np.asarray(fit.arm.probe) - np.asarray(nominal.arm.probe)
+    others = [abs(change) for name, change in far.items() if is_length(name) and name not in PROBE]
+    if np.linalg.norm(offset) > _MAINLY * max(others, default=0.0) and set(far) & set(PROBE):
+        differs = (
+            f"the tip of the probe is {np.linalg.norm(offset):.0f} mm from where it is stated in the arm's file, near "
+            f"{', '.join(f'{x:.0f}' for x in tip)} mm in the last frame"
+        )
+    return Mistake(f"Likely cause: {differs} ({shorten(texts, 4)}).", tuple(far), of_bounds=set(far) <= set(free))

@@ -18,7 +18,7 @@ ORDER, NEEDS = 80, "nothing"
 _TOLERANCE = math.radians(0.01)  # beyond a limit: more than the noise of any encoder
 # mm. An interferometer reaches 0.1 um in a metre; seats, probes and trackers of arms are far from it. Beyond 1 mm a
 # length or point says less than the nominal arm does.
-_SMALLEST_U, _LARGEST_U = 1e-4, 1.0
+SMALLEST_U, LARGEST_U = 1e-4, 1.0
 
 
 def test(case: Case) -> list[Finding]:
@@ -83,8 +83,8 @@ def _implausible_uncertainties(capture: Capture) -> list[Finding]:
     stated = [(f"[[length]] {length.start} - {length.end}", length.u) for length in capture.lengths]
     stated += [(f"[[{part.table}]] {part.name}", stated_u(part)) for part in capture.observations]
     positive = [(where, values[values > 0]) for where, u in stated for values in [np.asarray(u, dtype=float).ravel()]]
-    least = [(where, values.min() / UM) for where, values in positive if len(values) and values.min() < _SMALLEST_U]
-    most = [(where, values.max() / UM) for where, values in positive if len(values) and values.max() > _LARGEST_U]
+    least = [(where, values.min() / UM) for where, values in positive if len(values) and values.min() < SMALLEST_U]
+    most = [(where, values.max() / UM) for where, values in positive if len(values) and values.max() > LARGEST_U]
     small = [f"{where} (u = {u:.3g} um)" for where, u in least]
     large = [f"{where} (u = {u:,.0f} um)" for where, u in most]
     return [

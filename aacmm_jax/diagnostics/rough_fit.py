@@ -25,6 +25,7 @@ from ..kinematics.parameters import ArmSpecification, Bounds, Parameters
 from ..kinematics.priors import Prior
 from ..kinematics.workspace import total_link_length
 from ..model.observed import tips_of
+from .equations import PROBE
 
 # Standard deviations of a real arm's parameters from nominal ones, of its size or rad, and of its tips.
 _LENGTH, _PROBE, _TWIST, _ZERO, _TIP = 0.004, 0.03, 0.5 * DEG, 1.5 * DEG, 5e-4
@@ -32,6 +33,7 @@ _BOX, _TURN, _TOOL = 0.1, 10 * DEG, 0.5  # half-widths of the bounds: lengths, a
 _STEPS = 100  # most evaluations of each solve: what takes more has no solution near the nominal arm
 _EXPLAINED = 0.003  # of the arm's size: a smaller residual is left by a real arm
 _FAR = 8.0  # from the geometry, over the median pose or the usual errors of tips, beyond which a pose is wrong
+_GAP = 3.0  # ratio of the distance of the nearest wrong pose to that of the farthest right one
 _MOST = 0.25  # of all poses that may be wrong
 
 
@@ -43,7 +45,9 @@ class RoughFit(NamedTuple):
     observations: tuple[AbstractObservation, ...]  # sockets first
     parts: Mapping[str, Float[np.ndarray, " k"]]  # of the geometry
     size: float  # of the arm, mm
-    limit: float  # distance from the geometry beyond which a pose is wrong, mm
+    rms: float  # distance from the geometry by the median pose, mm
+    near: float  # the distance up to which a pose is right, mm
+    limit: float  # and beyond which it is wrong
 
     def distances(self, observation: AbstractObservation) -> Float[np.ndarray, " m"]:
         """Distance of each pose of an observation from the geometry, mm; an angle counts as the arm's lever makes it.
@@ -65,7 +69,8 @@ class RoughFit(NamedTuple):
 def rough_fit(nominal: ArmSpecification, capture: Capture) -> RoughFit | None:
     """The fit of a capture; None where most poses do not agree with any arm near the nominal one."""
     base = to_numpy(nominal.bounds().space.base)
-    names = tuple(name for name in nominal.space().names if name not in correction_names(base))
+    free = [name for name in nominal.space().names if name not in correction_names(base)]
+    names = tuple(dict.fromkeys([*free, *PROBE]))  # a tool may be anywhere; the prior decides what data leave open
     space, size = Parameters(base, names), max(total_link_length(base), 1e-9)
     prior = Prior({"lengths": _LENGTH * size, "angles": _TWIST, "theta": _ZERO, "probe": _PROBE * size})
     solving = Solving(
@@ -81,8 +86,21 @@ def rough_fit(nominal: ArmSpecification, capture: Capture) -> RoughFit | None:
     linear = solution.linear
     parts = linear.observed.split(np.asarray(linear.z)[len(names) :])
     arm = to_numpy(space.arm(np.asarray(linear.z)[: len(names)]))
-    fit = RoughFit(arm, names, linear.observed.observations, parts, size, np.inf)
+    fit = RoughFit(arm, names, linear.observed.observations, parts, size, np.inf, np.inf, np.inf)
     distances = np.concatenate([fit.distances(observation) for observation in fit.observations])
     middle = float(np.median(distances))
-    fit = fit._replace(limit=_FAR * max(middle, _TIP * size))
+    near = _FAR * max(middle, _TIP * size)
+    fit = fit._replace(rms=np.sqrt(2) * middle, near=near, limit=_limit(np.sort(distances), near))
     return fit if middle <= _EXPLAINED * size and np.mean(distances > fit.limit) <= _MOST else None
+
+
+def _limit(distances: Float[np.ndarray, " m"], least: float) -> float:
+    """The largest gap between distances in their order, beyond ``least``: wrong poses are far from all others, where
+    those of an arm that is worse than usual follow each other; infinite where there is no such gap."""
+    after = np.flatnonzero(distances > least)
+    after = after[after > 0]
+    if not len(after):
+        return np.inf
+    ratios = distances[after] / np.maximum(distances[after - 1], least / _FAR)
+    largest = int(np.argmax(ratios))
+    return float(distances[after[largest]]) / np.sqrt(_GAP) if ratios[largest] > _GAP else np.inf

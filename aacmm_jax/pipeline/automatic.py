@@ -165,7 +165,7 @@ def _removed(mistake: Misplaced, again: CalibrationRecord, rms: float) -> Remove
     return Removed(
         kind=POSE if len(mistake.poses) == 1 else POSES,
         group=f"{shorten(mistake.names, 3)} ({mistake.says})",
-        members=tuple(dict.fromkeys((*mistake.names, *mistake.groups))),
+        members=mistake.concerns,
         ratio=ratio,
         degrees_of_freedom=(count, freedom),
         probability=f_tail(ratio, count, freedom),

@@ -17,7 +17,7 @@ from ..data.capture import join_sessions
 from ..data.noise import Noise
 from ..data.recording import Recording
 from ..diagnostics.findings import case_of
-from ..diagnostics.mistakes import mistake_in_data
+from ..diagnostics.mistakes import mistake_in_data, single_mistake
 from ..kinematics.corrected_arm import with_corrections
 from ..kinematics.priors import Prior, default_prior
 from ..model.loss_names import LossName
@@ -153,12 +153,15 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         record = record._replace(decisions=decided)
         if automatic:
             record = chosen.stage("Checking poses", lambda: without_misplaced(record, solved, recorded))
-            # First, as a search of seconds; that of orders, signs and zeros takes ten times as long.
-            further = chosen.model is None and nominal.arm.corrections is None
-            record = chosen.stage("Checking couplings", lambda: with_full_couplings(record, solved, recorded, further))
-            check = lambda: with_corrected_readings(record, solved, recorded)  # noqa: E731
-            record, explanation = chosen.stage("Checking readings", check)
-            capture = capture if explanation is None else corrected_capture(capture, explanation) or capture
+            mistake = None if matches(record) else case_of(record).once(single_mistake)
+            if mistake is None:
+                further = chosen.model is None and nominal.arm.corrections is None
+                coupled = lambda: with_full_couplings(record, solved, recorded, further)  # noqa: E731
+                record = chosen.stage("Checking couplings", coupled)
+            if mistake is None or mistake.of_readings:  # a search of seconds
+                check = lambda: with_corrected_readings(record, solved, recorded)  # noqa: E731
+                record, explanation = chosen.stage("Checking readings", check)
+                capture = capture if explanation is None else corrected_capture(capture, explanation) or capture
         # Where a mistake in the recording remains, every other remedy would only make up for it.
         mistake = None if not automatic or matches(record) else case_of(record).once(mistake_in_data)
         sound = mistake is None or mistake.of_bounds

@@ -376,7 +376,7 @@ KINDS: dict[str, Kind] = {
         (r"zero of joint {joint}", r"offset[^.]*joint {joint}", r"\[theta_{joint}\]")),
     "degrees for radians": Kind(converted(np.degrees), "", False, (r"degrees|in deg|\bdeg\b|unit of the readings",)),
     "wrong unit of lengths": Kind(length_unit, "", False, (r"\bin (m|cm|metres|inches)\b", r"^implausible-scale")),
-    "left-handed": Kind(left_handed, "", False, (r"left-handed|mirror|exchanged axes",),
+    "left-handed": Kind(left_handed, "", False, (r"left-handed|mirror|exchanged axes|columns of positions are y x z",),
         lambda case: case.kind in ("points", "transforms")),
     "u too small": Kind(stated_u(0.1), "", False, (r"\bu\b[^.]*too small|^lengths-disagree|u and the|their u\b",)),
     "u too large": Kind(stated_u(10.0), "", False, (r"\bu\b[^.]*too large",)),
