@@ -7,6 +7,7 @@ The names below are those that most scripts need; everything else is grouped by 
 * `calibration`: the solve, one and many, and its results. `diagnostics`: what judges a result or its data.
 * `pipeline`: identify and calibrate. `study`: calibrations by the thousand.
 * `acceptance`, `drift`, `planning`: tests by standards, calibrations compared, which poses to take.
+* `camera`: boards, their corners in images, models of cameras.
 * `files`: every format. `summaries`: sentences and tables. `report`, `plot`, `certificate`, `cli`: what people read.
 * `core`: arrays, errors, `units`.
 

@@ -1,5 +1,6 @@
 from . import acceptance as acceptance
 from . import calibration as calibration
+from . import camera as camera
 from . import certificate as certificate
 from . import data as data
 from . import diagnostics as diagnostics

@@ -25,6 +25,7 @@ LAYERS = (
     {"plot", "certificate"},
     {"study"},
     {"files", "summaries"},
+    {"camera"},
     {"pipeline"},
     {"acceptance", "drift", "planning"},
     {"diagnostics"},
@@ -226,6 +227,7 @@ def test_every_import_of_another_package_is_declared():
         "PIL",  # comes with matplotlib
         "xarray",  # the extra data
         "distributed",  # the extra dask
+        "cv2",  # the extra camera
         *(each.split(">=")[0] for each in DEPENDENCIES),
     }
     imported = set()

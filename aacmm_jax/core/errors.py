@@ -9,7 +9,7 @@ from .text import in_short, quoted
 
 _COMPARED = 200  # characters of a word: comparing takes their square
 # By extra of pyproject.toml, the package whose presence says whether it is installed.
-_PACKAGES = {"plot": "matplotlib", "report": "jinja2", "data": "xarray", "dask": "distributed"}
+_PACKAGES = {"plot": "matplotlib", "report": "jinja2", "data": "xarray", "dask": "distributed", "camera": "cv2"}
 
 
 class InputError(ValueError):

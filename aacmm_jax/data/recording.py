@@ -74,6 +74,8 @@ class Recording(NamedTuple):
         usual: Noise that the arm's file states, with which an estimated one is compared; None where it states none.
         as_found: The arm with the parameters that its controller had on arrival; None where they are not known. The
             nominal arm is not it, unless somebody says so.
+        stated: What somebody stated of how it is to be read, which no search for mistakes overrules: "columns", "sign",
+            "offset" and "unit" of the joint readings, "units" of measured points.
 
     Example:
         >>> recorded = aj.Recording(capture, nominal, measured="2026-01-31")
@@ -92,3 +94,4 @@ class Recording(NamedTuple):
     measuring_range: float | None = None
     usual: ArmNoise | None = None
     as_found: ArmSpecification | None = None
+    stated: tuple[str, ...] = ()

@@ -91,8 +91,11 @@ def likely_cause(arm: Arm, capture: Capture) -> Mistake | None:
     alike = [other.cause for _, other in others if not set(other.concerns) & set(best.concerns)]
     also = f" Equally likely: {shorten(alike, 3)}." if alike else ""
     rms /= _ADJUSTED if best.zero else 1.0
-    reduced = f"Correcting this reduces the residuals (nominal arm) from {given:.3g} to {rms:.3g} mm RMS."
-    return Mistake(f"Likely cause: {best.cause}. {reduced}{best.line}{also}", best.concerns, best.of_readings)
+    says = (
+        f"Likely cause: {best.cause}. Correcting this reduces the residuals (nominal arm) from {given:.3g} to "
+        f"{rms:.3g} mm RMS.{best.line}{also}"
+    )
+    return Mistake(says, best.concerns, best.of_readings)
 
 
 def _thinned(observations: Sequence[AbstractObservation]) -> Capture:

@@ -158,7 +158,7 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
 
 
 def _field(entry: Entry) -> Field:
-    content = "number" if entry.content == "points" else entry.content
+    content = {"points": "number", "ids": "count"}.get(entry.content, entry.content)
     return Field(entry.says, entry.unit, entry.dimensions, content)
 
 

@@ -108,8 +108,23 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
             measuring_range=model.measuring_range,
             usual=usual_noise(arm, base=model.base, tip=model.tip),
             as_found=as_found,
+            stated=_stated(model),
         )
         return recording, readings
+
+
+def _stated(model: PosesManifest) -> tuple[str, ...]:
+    """What the manifest states of readings and points, as `Recording.stated` names it."""
+    given = set() if model.angles is None else model.angles.model_fields_set
+    stated = given & {"columns", "sign", "offset", "unit"}
+    for table in (entry for kind in TABLES for entry in getattr(model, kind.table)):
+        picked = "q" in table.columns if isinstance(table.columns, dict) else bool(table.columns)
+        stated |= {
+            name
+            for name, by_hand in (("columns", picked), ("unit", "q" in table.units), ("units", "points" in table.units))
+            if by_hand
+        }
+    return tuple(sorted(stated))
 
 
 def _as_found(file: str | Path, nominal: Arm) -> ArmSpecification:

@@ -15,6 +15,9 @@ RECORDING: Fields = {
     "measured": text("day of the measurement"),
     "acceptance": text("standards whose acceptance procedure was followed", among=("", *STANDARDS)),
     "measuring_range": number("diameter of the measuring volume, as the maker states it", "mm"),
+    "stated": text(
+        "what the manifest states of the readings and points", among=("", "columns", "sign", "offset", "unit", "units")
+    ),
 }
 
 NOISE: Fields = {
@@ -260,6 +263,13 @@ UNCERTAINTY: Fields = {
     "open": number("projector onto the combinations that the data do not determine, in mm and mrad", "1", *_SQUARE),
     "noise": part(NOISE),
     "scatter_degrees_of_freedom": number("degrees of freedom of the noise", "1", least=0),
+}
+
+KEPT_GEOMETRY: Fields = {
+    "names": text("part of the geometry", "kept", name="kept"),
+    "values": number("value, as the calibration found it", "mm or rad", "kept"),
+    "follow": number("derivatives with respect to the parameters", "quotients of units", "kept", "kept_parameter"),
+    "covariance": number("covariance for given parameters", "products of units", "kept", "kept_2"),
 }
 
 JUDGED: Fields = {

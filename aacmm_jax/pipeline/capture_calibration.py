@@ -18,10 +18,12 @@ from ..data.noise import Noise
 from ..data.recording import Recording
 from ..diagnostics.findings import case_of
 from ..diagnostics.mistakes import mistake_in_data, single_mistake
+from ..diagnostics.reading_fit import Explanation
 from ..kinematics.corrected_arm import with_corrections
 from ..kinematics.priors import Prior, default_prior
 from ..model.loss_names import LossName
 from .automatic import (
+    Record,
     matches,
     with_best_model,
     with_full_couplings,
@@ -139,7 +141,9 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
     if automatic:
         recording, chosen, decided = with_prior_of_few(recording, chosen)
     anchor = None if chosen.hold == _SOLVE.hold else (chosen.hold,)  # two stages, which no other model would have
-    stated = (chosen.model, chosen.robust, chosen.method, anchor, recording.nominal.prior, nominal.arm.corrections)
+    prior = chosen.prior is None or recording.nominal.prior is not None
+    given = (chosen.model, chosen.robust, chosen.method, anchor, nominal.arm.corrections)
+    stated = prior or any(value is not None for value in given)
 
     def recorded(result: Calibration | Identification, part: Recording) -> CalibrationRecord:
         record = record_of(result, part, robust=chosen.robust)
@@ -152,26 +156,18 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         record = chosen.stage("Calibrating", lambda: recorded(solved(recording), recording))
         record = record._replace(decisions=decided)
         if automatic:
-            record = chosen.stage("Checking poses", lambda: without_misplaced(record, solved, recorded))
-            mistake = None if matches(record) else case_of(record).once(single_mistake)
-            if mistake is None:
-                further = chosen.model is None and nominal.arm.corrections is None
-                coupled = lambda: with_full_couplings(record, solved, recorded, further)  # noqa: E731
-                record = chosen.stage("Checking couplings", coupled)
-            if mistake is None or mistake.of_readings:  # a search of seconds
-                check = lambda: with_corrected_readings(record, solved, recorded)  # noqa: E731
-                record, explanation = chosen.stage("Checking readings", check)
-                capture = capture if explanation is None else corrected_capture(capture, explanation) or capture
+            further = chosen.model is None and nominal.arm.corrections is None
+            record, explanation = _with_corrected_data(record, chosen, recorded, further)
+            capture = capture if explanation is None else corrected_capture(capture, explanation) or capture
         # Where a mistake in the recording remains, every other remedy would only make up for it.
         mistake = None if not automatic or matches(record) else case_of(record).once(mistake_in_data)
-        sound = mistake is None or mistake.of_bounds
-        if automatic and sound:
-            record = chosen.stage("Checking bounds", lambda: with_wider_bounds(record, solved, recorded))
-        if sound and (chosen.remove_contradicting or (automatic and chosen.robust is None)):
-            # Bad poses do not move a robust fit.
-            record = chosen.stage("Comparing groups", lambda: without_contradicting(record, solved, recorded))
-        if automatic and sound and all(value is None for value in stated):
-            record = with_best_model(record, recorded, chosen)
+        if mistake is None or mistake.of_bounds:
+            if automatic:
+                record = chosen.stage("Checking bounds", lambda: with_wider_bounds(record, solved, recorded))
+            if chosen.remove_contradicting or (automatic and chosen.robust is None):  # which bad poses do not move
+                record = chosen.stage("Comparing groups", lambda: without_contradicting(record, solved, recorded))
+            if automatic and not stated:
+                record = with_best_model(record, solved, recorded, chosen)
         if masks:
             record = chosen.stage("Testing held-out poses", lambda: tested(record, capture, masks))
         if _to_cross_validate(record, chosen):
@@ -185,6 +181,22 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
             sampled = chosen.stage("Drawing trials", lambda: monte_carlo(result, record.recording.capture))
             record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
     return record
+
+
+def _with_corrected_data(
+    record: CalibrationRecord, chosen: CaptureOptions, recorded: Record, further: bool
+) -> tuple[CalibrationRecord, Explanation | None]:
+    """The calibration without poses that were mixed up, with couplings, and with the readings corrected, where the data
+    do not match the arm; and how they were corrected. ``further``: whether couplings may be added to the model."""
+    solved = partial(_solved, chosen)
+    record = chosen.stage("Checking poses", lambda: without_misplaced(record, solved, recorded))
+    mistake = None if matches(record) else case_of(record).once(single_mistake)
+    if mistake is None:
+        coupled = chosen.stage("Checking couplings", lambda: with_full_couplings(record, solved, recorded, further))
+        return chosen.stage("Checking readings", lambda: with_corrected_readings(coupled, solved, recorded))
+    if mistake.of_readings:  # a search of seconds
+        return chosen.stage("Checking readings", lambda: with_corrected_readings(record, solved, recorded))
+    return record, None
 
 
 def _solving(chosen: CaptureOptions, prior: Prior | None) -> CalibrationOptions:
@@ -270,4 +282,5 @@ def join_recordings(recordings: Mapping[str, Recording], *, same_probe: bool = F
         {name: recording.capture for name, recording in recordings.items()}, own_probe=not same_probe
     )
     sources = tuple(source for recording in recordings.values() for source in recording.sources)
-    return first._replace(capture=capture, true=None, seed=None, spheres=(), sources=sources)
+    stated = tuple(sorted({name for recording in recordings.values() for name in recording.stated}))
+    return first._replace(capture=capture, true=None, seed=None, spheres=(), sources=sources, stated=stated)

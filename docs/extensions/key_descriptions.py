@@ -185,6 +185,7 @@ DESCRIPTIONS = {
     "plane": "A plane that was touched.",
     "planes": "A plane that is touched, or two at a `distance`.",
     "parallel_planes": "Two parallel planes at a certified distance.",
+    "pixels": "Corners of a target that a camera saw.",
     "distances": "Measured distances from a pivot: telescoping bar, draw wire.",
     "transforms": "Positions and orientations that an instrument measures.",
     "readings": "File of the readings, with as many rows as `file`.",

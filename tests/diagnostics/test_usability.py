@@ -66,7 +66,7 @@ def made(readings, changed, stated=None):
         (wrong_sign, None, "unusable", "Likely cause: joint 4 was read with the wrong sign."),
         (wrong_zero, None, "unusable", "Likely cause: the zero of joint 3 is -45 deg off."),
         (exchanged, None, "unusable", "Most likely: errors in B."),
-        (as_read, 0.05, "doubt", "Likely cause: the arm differs from what is stated in its file by more than the bounds"),
+        (as_read, 0.05, "doubt", "Likely cause: the arm differs from what is stated in its file by more than"),
     ],
 )
 def test_reasons(readings, changed, stated, severity, reason):
