@@ -14,10 +14,10 @@ from .contradictions import session_metrics
 from .culprits import missing
 from .equations import EXACT
 from .findings import Case, Finding, findings_of
-from .mistakes import TRY_ALL, mistake_in_data
+from .mistakes import mistake_in_data
 from .noisy_encoders import noisiest_joint
 from .pose_residuals import distances_of
-from .residual_tests import LEVEL
+from .residual_tests import SURE
 
 ORDER, NEEDS = 10, "nothing"
 _APART = 5.0  # RMS of a session among others, over that which it has alone, beyond which they are not of one arm
@@ -25,26 +25,12 @@ _MOST, _FEW = 0.5, 0.05  # part of the squared residuals that a few poses have, 
 
 
 def test(case: Case) -> list[Finding]:
-    """A solve that did not end, residuals that no arm has, and parameters most of which ended on a bound."""
+    """A solve that did not end, and residuals that no arm has."""
     record, findings = case.record, []
     if not record.converged and not record.reason.startswith(SCALE_REFUSED):  # that is said by another finding
         findings.append(Finding("not-converged", record.reason, severity="unusable"))
     if record.residual > record.largest_usual_residual:
         findings.append(_of_residuals(case))
-    elif record.plausible_scale and many_on_bounds(record):
-        sides, mistake = on_bounds(record), case.once(mistake_in_data)
-        widen = f"Widen the bounds (--length-bound-mm, --angle-bound-deg). {TRY_ALL}"
-        findings.append(
-            Finding(
-                "many-on-bounds",
-                f"{len(sides)} of {len(record.names)} parameters are on a bound, so either the bounds are too narrow, "
-                "or the data do not match the arm.",
-                advice=widen if mistake is None else mistake.says,
-                severity="doubt",
-                doubt=f"on a bound: {shorten(sorted(sides), 3)}",
-                concerns=tuple(sides) if mistake is None else mistake.concerns,
-            )
-        )
     return findings
 
 
@@ -100,7 +86,7 @@ def likely_reason(case: Case) -> str:
         # What equations linear in the residuals tell, which must be small for that.
         noisiest = case.once(noisiest_joint)
         joints = [encoder.joint for encoder in record.noisy_encoders]
-        joints += [noisiest.joint] if noisiest is not None and noisiest.probability < LEVEL else []
+        joints += [noisiest.joint] if noisiest is not None and noisiest.probability < SURE else []
         if joints:
             return f"play or a loose encoder in joint {joints[0]}"
         bending = [str(term.joint) for term in case.once(missing) if term.kind == "gravity"]

@@ -50,6 +50,13 @@ SPHERES: Fields = {
     "u_form": number("standard uncertainty of the form error", "mm", least=0),
 }
 
+IMAGES: Fields = {
+    "observation": text("observation to which the image belongs"),
+    "image": text("name of the image, or number of its pose"),
+    "corners": count("number of corners"),
+    "refused": text("why the image is not used; empty if it is used"),
+}
+
 _COEFFICIENTS = ("coefficient", "coefficient_2")
 _GEOMETRY: Fields = {
     "alpha": number("link twist", "rad", "joint"),
@@ -300,6 +307,7 @@ TABLES: dict[str, Fields] = {
     "usual_noise": USUAL_NOISE,
     "reference": LENGTHS,
     "sphere": SPHERES,
+    "images": IMAGES,
     "parameters": CALIBRATION,
     "monte_carlo": SAMPLED,
     "noisy_encoders": NOISY_ENCODERS,

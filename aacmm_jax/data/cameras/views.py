@@ -162,6 +162,14 @@ def _mirrored(views: Views, corners: Corners) -> Views:
     return Views(rotation, origin - np.einsum("mij,mj->mi", rotation, middle))
 
 
+def _on_a_line(corners: Corners) -> Bool[np.ndarray, " m"]:
+    """Whether the points that an image shows are on one line, about which the target may turn."""
+    weights = corners.present[..., None] / np.maximum(corners.present.sum(axis=1), 1)[:, None, None]
+    apart = weights * (corners.points - np.sum(weights * corners.points, axis=1, keepdims=True))
+    sizes = np.linalg.svd(apart, compute_uv=False)
+    return sizes[:, 1] <= _PLANAR * sizes[:, 0]
+
+
 def views_of(
     corners: Corners, intrinsics: Float[np.ndarray, " k"], rounds: int = _ROUNDS
 ) -> tuple[Views, Float[np.ndarray, " m"]]:
@@ -169,7 +177,7 @@ def views_of(
     squares; others have the origin 0 and an infinite sum."""
     m, points = len(corners.values), corners.model.dimension == 3
     views = Views(np.tile(np.eye(3), (m, 1, 1)), np.zeros((m, 3)))
-    enough = corners.present.sum(axis=1) >= (3 if points else 4)
+    enough = (corners.present.sum(axis=1) >= (3 if points else 4)) & ~_on_a_line(corners)
     if not enough.any():
         return views, np.full(m, np.inf)
     directions = corners.model.directions(np.moveaxis(corners.values, -1, 0), intrinsics)

@@ -49,7 +49,8 @@ class Entry(NamedTuple):
     @property
     def content(self) -> Content:
         """By its type: number, count, text, truth, points (a dictionary of points by name) or ids (whole numbers)."""
-        alternatives = (get_origin(self.annotation), self.annotation, *get_args(self.annotation))
+        alternatives = [get_origin(self.annotation), self.annotation, *get_args(self.annotation)]
+        alternatives += [part for inner in alternatives for part in get_args(inner)]
         contents: list[Content] = [_CONTENTS[kind] for kind in alternatives if kind in _CONTENTS]
         return contents[0] if contents else "number"
 
