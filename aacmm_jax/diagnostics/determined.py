@@ -95,9 +95,7 @@ def _many(case: Case, sides: dict[str, str]) -> Finding:
         "many-on-bounds",
         f"{len(sides)} of {len(case.record.names)} parameters are on a bound, so either the bounds are too narrow, or "
         "the data do not match the arm.",
-        advice=f"Widen the bounds (--length-bound-mm, --angle-bound-deg). {TRY_ALL}"
-        if mistake is None
-        else mistake.says,
+        advice=f"{widen} {TRY_ALL}" if mistake is None else mistake.says,
         severity="doubt",
         doubt=f"on a bound: {shorten(sorted(sides), 3)}",
         concerns=tuple(sides) if mistake is None else mistake.concerns,
