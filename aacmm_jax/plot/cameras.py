@@ -33,6 +33,7 @@ _FAR = 5.0  # medians of the residuals: farther ones are drawn in another tone
 class Image(NamedTuple):
     """All that one camera saw in a calibration: c corners of all its images."""
 
+    number: int  # of the camera, from 1
     camera: str
     model: AbstractCamera
     intrinsics: Float[np.ndarray, " k"]
@@ -55,13 +56,13 @@ def images_of(record: CalibrationRecord) -> list[Image]:
     arm, geometry = record.calibrated.arm, record.observed.geometry
     observations = [each for each in record.recording.capture.observations if isinstance(each, Pixels)]
     images = []
-    for name in dict.fromkeys(each.camera for each in observations):
+    for number, name in enumerate(dict.fromkeys(each.camera for each in observations), start=1):
         own = [each for each in observations if each.camera == name]
-        images.append(_image(own, [reprojection(arm, each, geometry) for each in own]))
+        images.append(_image(own, [reprojection(arm, each, geometry) for each in own], number))
     return images
 
 
-def _image(observations: list[Pixels], seen: list[Reprojection]) -> Image:
+def _image(observations: list[Pixels], seen: list[Reprojection], number: int = 1) -> Image:
     first, intrinsics = observations[0], seen[0].intrinsics
     corners, residuals = (
         np.concatenate([getattr(each, field)[each.seen][:, :2] for each in seen]) for field in ("measured", "residual")
@@ -78,8 +79,8 @@ def _image(observations: list[Pixels], seen: list[Reprojection]) -> Image:
         owner.append(len(names) + np.nonzero(each.seen)[0])
         names += observation.images or [f"{observation.name}, pose {i + 1}" for i in range(len(observation.q))]
     return Image(
-        camera=first.camera, model=first.camera_model, intrinsics=intrinsics, low=low, high=high, corners=corners,
-        residuals=residuals, ids=np.concatenate(ids), owner=np.concatenate(owner), names=names,
+        number=number, camera=first.camera, model=first.camera_model, intrinsics=intrinsics, low=low, high=high,
+        corners=corners, residuals=residuals, ids=np.concatenate(ids), owner=np.concatenate(owner), names=names,
     )  # fmt: skip
 
 
@@ -121,7 +122,7 @@ def coverage_chart(image: Image) -> Chart:
         "an extrapolation."
     )
     title = f"Where {image.camera} saw corners"
-    return Chart(f"coverage-{image.camera}", title, description, (_plot(image, (marks,)),))
+    return Chart(f"coverage-{image.number}", title, description, (_plot(image, (marks,)),))
 
 
 def residual_chart(image: Image, most: int | None = None) -> Chart:
@@ -152,7 +153,7 @@ def residual_chart(image: Image, most: int | None = None) -> Chart:
     description += f" {len(chosen)} of {len(sizes)} corners are drawn." if len(chosen) < len(sizes) else ""
     title = f"Residuals in the image of {image.camera}"
     plot = _plot(image, tuple(marks), f"arrows: {factor:g} times the residuals")
-    return Chart(f"arrows-{image.camera}", title, description, (plot,), _by_image(image, sizes))
+    return Chart(f"arrows-{image.number}", title, description, (plot,), _by_image(image, sizes))
 
 
 def _by_image(image: Image, sizes: Float[np.ndarray, " c"]) -> Table:
@@ -201,7 +202,7 @@ def distortion_chart(image: Image) -> Chart | None:
     description += f" In {pluralise(unknown, 'cell')} the distortion folds back." if unknown else ""
     title = f"Distortion of {image.camera}"
     plot = _plot(image, marks, f"arrows: {factor:g} times the displacement")
-    return Chart(f"distortion-{image.camera}", title, description, (plot,))
+    return Chart(f"distortion-{image.number}", title, description, (plot,))
 
 
 def _magnification(sizes: np.ndarray, length: float) -> float:

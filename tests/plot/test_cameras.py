@@ -12,7 +12,7 @@ from tests.refusals import assert_refused
 ARROW = 7  # points of the path of one
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def image(camera_record):
     [image] = cameras.images_of(camera_record)
     return image
@@ -108,7 +108,7 @@ def test_figures(camera_record, record_without_cameras, name):
     assert_refused(lambda: figure(record_without_cameras), "has no camera", "pixels")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def record_without_cameras(camera_record):
     recording = camera_record.recording
     return camera_record._replace(recording=recording._replace(capture=aj.Capture({"A": np.zeros((1, 6))})))
