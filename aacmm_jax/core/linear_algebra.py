@@ -5,6 +5,7 @@ in one program can wait for each other forever (measured on two cores with four)
 of JAX; for NumPy's it is the better choice.
 """
 
+import math
 from typing import Any
 
 import jax
@@ -64,6 +65,17 @@ def products(left: Float[AnyArray, "r c m"], right: Float[AnyArray, "s c m"]) ->
 def matrix_products(left: Float[AnyArray, "r s m"], right: Float[AnyArray, "s c m"]) -> Float[AnyArray, "r c m"]:
     """The product of two matrices a pose."""
     return products(left, namespace(right).swapaxes(right, 0, 1))
+
+
+def rows_times(rows: Float[AnyArray, "*batch p"], matrix: Float[AnyArray, "p q"]) -> Float[AnyArray, "*batch q"]:
+    """Every row times a matrix, by one product: NumPy computes a batch of products of few rows one by one."""
+    flat = rows.reshape(math.prod(rows.shape[:-1]), matrix.shape[0])
+    return (flat @ matrix).reshape(*rows.shape[:-1], matrix.shape[1])
+
+
+def quadratic_forms(rows: Float[AnyArray, "*batch p"], matrix: Float[AnyArray, "p p"]) -> Float[AnyArray, "*batch"]:
+    """x^T M x of every row x; einsum of all three would go through p^2 entries a row."""
+    return namespace(rows, matrix).sum(rows_times(rows, matrix) * rows, axis=-1)
 
 
 def solve_positive_definite(matrix: Square, right: Rows) -> Rows:

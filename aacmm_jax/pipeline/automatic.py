@@ -23,10 +23,11 @@ from ..diagnostics.contradictions import remove_contradicting
 from ..diagnostics.equations import EXACT
 from ..diagnostics.reading_check import coupling_words
 from ..diagnostics.usability import on_bounds
-from ..kinematics.arm import correction_names, is_length, without_corrections
+from ..kinematics.arm import correction_names, is_length, value_of, without_corrections
 from ..kinematics.corrected_arm import with_further_corrections
 from ..kinematics.parameters import ArmSpecification
 from ..kinematics.priors import default_prior
+from ..kinematics.workspace import total_link_length
 from .model_ladder import ComparedModels, compare_models, default_models
 
 Solve = Callable[[Recording], Calibration | Identification]
@@ -34,6 +35,7 @@ Record = Callable[[Calibration | Identification, Recording], CalibrationRecord]
 
 _WIDER, _ROUNDS = 5.0, 4  # factor by which bounds that were reached are widened, and how often
 _WIDEST = np.pi / 2  # rad
+_SIZE = 2.0  # factor within which the size of an arm stays that of the nominal one
 _BY_CHANCE = 0.01  # probability of so much smaller residuals by chance, below which wider bounds are kept
 _PLAIN = "dh"
 _SOME, _FUNCTIONS = "harmonics=1-6", "functions"
@@ -44,8 +46,8 @@ def with_full_couplings(record: CalibrationRecord, solve: Solve, recorded: Recor
     """The calibration with joints that move by the readings of others as well, where the readings do not fit the arm
     without (`search_couplings`); else as it is.
 
-    Where a model is stated (not ``further``), only its own couplings are set. A coupling is a coefficient like any
-    other, but its nominal value, which is the mean of its prior, is 1 or -1 instead of 0.
+    Where a model is stated (not ``further``), only its own couplings are set, and none with a stated value. A coupling
+    is a coefficient like any other, but its nominal value, which is the mean of its prior, is 1 or -1 instead of 0.
     """
     nominal, capture = record.recording.nominal, record.recording.capture
     try:
@@ -53,7 +55,8 @@ def with_full_couplings(record: CalibrationRecord, solve: Solve, recorded: Recor
     except InputError:  # neither sockets nor points
         return record
     missing = [name for name in couplings if name not in correction_names(nominal.arm)]
-    if not couplings or (missing and not further):
+    stated = any(value_of(nominal.arm, name) for name in couplings if name not in missing)
+    if not couplings or stated or (missing and not further):
         return record
     arm = with_further_corrections(nominal.arm, missing).replace(**couplings)
     recording = record.recording._replace(nominal=nominal._replace(arm=arm))
@@ -84,7 +87,10 @@ def with_wider_bounds(record: CalibrationRecord, solve: Solve, recorded: Record)
         except InputError:  # with such bounds the data do not determine the arm
             break
         wider = recorded(result, recording)
-        if wider.converged and _is_better(wider, best, len(reached)):
+        size, usual = (total_link_length(arm) for arm in (wider.calibrated.arm, nominal.arm))
+        # Points in a wrong unit fit an arm that shrinks, or grows, with its bounds.
+        of_this_size = usual / _SIZE < size < usual * _SIZE
+        if wider.converged and of_this_size and _is_better(wider, best, len(reached)):
             best = wider
     if best is record:
         return record
@@ -131,7 +137,7 @@ def without_contradicting(record: CalibrationRecord, solve: Solve, recorded: Rec
     return kept._replace(decisions=record.decisions)
 
 
-def with_best_model(record: CalibrationRecord, recorded: Record, options: Any) -> CalibrationRecord:
+def with_best_model(record: CalibrationRecord, solve: Solve, recorded: Record, options: Any) -> CalibrationRecord:
     """The calibration with the model of the joints that predicts held-out regions best; as it is where that is the arm
     alone, or where there are too few poses to hold some out."""
     recording = record.recording
@@ -166,7 +172,7 @@ def with_best_model(record: CalibrationRecord, recorded: Record, options: Any) -
     )
     corrected = chosen.result.space.base
     modelled = recording._replace(nominal=nominal._replace(arm=corrected, prior=default_prior(corrected)))
-    again = recorded(chosen.result, modelled)
+    again = recorded(chosen.result if options.shared_errors else solve(modelled), modelled)
     return again._replace(removed=record.removed, decisions=(*record.decisions, says))
 
 

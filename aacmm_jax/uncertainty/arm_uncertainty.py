@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from ..core.arrays import Numbers, is_concrete
 from ..core.errors import InputError
-from ..core.linear_algebra import semidefinite_eigen
+from ..core.linear_algebra import quadratic_forms, rows_times, semidefinite_eigen
 from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known, to_numpy
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm, checked_readings
@@ -19,6 +19,7 @@ from .between_groups import BetweenGroups
 from .covariance import SharedErrors
 from .coverage import LEVEL
 from .degrees_of_freedom import Components, Law, coverage_factor, degrees_of_freedom
+from .kept_geometry import KeptGeometry
 from .shared_kinds import PLACES, SUCCESSIVE, VISITS
 
 
@@ -53,6 +54,8 @@ class Uncertainty(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     scatter_degrees_of_freedom: float = eqx.field(static=True)  # of the noise; infinite where it was given
     lengths: int = eqx.field(static=True, default=0, kw_only=True)  # from which k was found
+    # What an evaluation keeps of the geometry that the calibration found; None: everything is fitted.
+    kept: KeptGeometry | None = eqx.field(default=None, kw_only=True)
     # How poses of groups that were held out agree with their prediction; None: no groups were.
     between: BetweenGroups | None = eqx.field(static=True, default=None, kw_only=True)
 
@@ -136,7 +139,7 @@ class Uncertainty(eqx.Module):
     def parts(self, derivatives: Float[AnyArray, "... p"]) -> Float[AnyArray, "... c"]:
         """Variances of quantities with these derivatives by the parameters: by the scatter, then by `components`."""
         xp = namespace(self, derivatives)
-        whole = xp.einsum("...p,pq,...q->...", derivatives, self.covariance, derivatives)[..., None]
+        whole = quadratic_forms(derivatives, self.covariance)[..., None]
         if self.components is None:
             return whole
         others = self.components.variances(derivatives)
@@ -266,7 +269,7 @@ class Uncertainty(eqx.Module):
     def covariance_of_functions(self, derivatives: Float[AnyArray, "... k p"]) -> Float[AnyArray, "... k k"]:
         """Covariance of functions of the parameters with these derivatives; infinite where they follow what is open."""
         xp = namespace(self, derivatives)
-        covariance = derivatives @ self.covariance @ xp.swapaxes(derivatives, -1, -2)
+        covariance = rows_times(derivatives, self.covariance) @ xp.swapaxes(derivatives, -1, -2)
         return xp.where(self._is_open(derivatives)[..., None], np.inf, covariance)
 
     def parts_of_functions(self, derivatives: Float[AnyArray, "... p"]) -> Float[AnyArray, "... c"]:
@@ -290,7 +293,9 @@ class Uncertainty(eqx.Module):
     def _is_open(self, derivatives: Float[AnyArray, "... k p"]) -> Bool[AnyArray, "... k"]:
         """Which rows follow an undetermined direction."""
         xp = namespace(self, derivatives)
-        inside = derivatives @ (self.space.scale[:, None] * self.open)
+        if xp is np and not np.any(self.open):
+            return np.zeros(derivatives.shape[:-1], dtype=bool)
+        inside = rows_times(derivatives, self.space.scale[:, None] * self.open)
         return xp.sqrt(xp.sum(inside**2, axis=-1)) > _LEAST_COMPONENT
 
 

@@ -23,6 +23,7 @@ from jaxtyping import Float
 
 from ..core.distributions import student_density, student_quantile, student_tail
 from ..core.errors import InputError
+from ..core.linear_algebra import quadratic_forms
 from ..core.numpy_or_jax import AnyArray, namespace, set_at
 from .coverage import LEVEL
 
@@ -106,7 +107,8 @@ class Components(eqx.Module):
 
     def variances(self, derivatives: Float[AnyArray, "... p"]) -> Float[AnyArray, "... c"]:
         """Of quantities with these derivatives by the parameters."""
-        return namespace(self, derivatives).einsum("...p,cpq,...q->...c", derivatives, self.matrices, derivatives)
+        xp = namespace(self, derivatives)
+        return xp.stack([quadratic_forms(derivatives, matrix) for matrix in self.matrices], axis=-1)
 
 
 def effective_degrees_of_freedom(
