@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 Image = Float[np.ndarray, "h w"]
 Ends = Float[np.ndarray, "*edges 2"]  # px
 _ALONG = np.linspace(0.08, 0.92, 19)  # where edges are sampled, of their length
-_ACROSS = np.linspace(-1.0, 1.0, 17)
+_ACROSS = np.linspace(-1.0, 1.0, 25)
 _ROUNDS = 3
 _CURVED = 40.0  # px: a longer edge is fitted by a parabola, since distortion bends it
 _STRAIGHT = 0.1  # weight of a curvature of 0, against that of a sample: of noise 0.1 px and a curvature of 0.3 px
