@@ -25,7 +25,12 @@ _MOVED = 1.6  # the blur in one direction, divided by that in the other
 
 
 class Detection(NamedTuple):
-    """The corners of a target that were found in an image."""
+    """The corners of a target that were found in an image.
+
+    Example:
+        >>> aj.camera.detect(np.full((480, 640), 90, dtype=np.uint8), aj.camera.Charuco(7, 5, 30.0, 22.0)).refused
+        'no marker of the target was found: it has no contrast'
+    """
 
     ids: Int[np.ndarray, " k"]
     corners: Float[np.ndarray, "k 2"]  # px; the centre of the first pixel is 0, 0
@@ -53,6 +58,14 @@ def detect(
 
     Raises:
         InputError: The file is not an image, the target cannot be recognised in images, or OpenCV is not installed.
+
+    Example:
+        >>> board, facing = aj.camera.Charuco(7, 5, 30.0, 22.0), np.eye(4)
+        >>> facing[:3, 3] = -105.0, -75.0, 400.0  # mm
+        >>> image = aj.camera.render(board, facing, "pinhole", [600.0, 600.0, 319.5, 239.5], (640, 480))
+        >>> found = aj.camera.detect(image, board)
+        >>> print(len(found.ids), found.corners[0].round())
+        24 [207. 172.]
     """
     require("camera", "Detection of corners in images")
     if isinstance(target, Checkerboard) and (target.columns + target.rows) % 2 == 0:
@@ -75,8 +88,10 @@ def detect(
             ids, corners = checkerboard_corners(grey, target)
         else:
             tags, quadrilaterals, note = target_markers(grey, target)
-            corners_of = charuco_corners if isinstance(target, Charuco) else tag_corners
-            ids, corners = corners_of(grey, target, tags, quadrilaterals)
+            if isinstance(target, Charuco):
+                ids, corners = charuco_corners(grey, target, tags, quadrilaterals)
+            else:
+                ids, corners = tag_corners(grey, target, tags, quadrilaterals)
         kept = inside(grey, corners, BORDER)
         ids, corners = ids[kept], corners[kept]
         blur = _checked_blur(grey, target, ids, corners)
@@ -117,6 +132,12 @@ def overlay(image: str | os.PathLike | Grey, detection: Detection, *, longest: i
 
     Raises:
         InputError: The file is not an image, or OpenCV is not installed.
+
+    Example:
+        >>> board, dark = aj.camera.Charuco(7, 5, 30.0, 22.0), np.zeros((480, 640), dtype=np.uint8)
+        >>> picture = aj.camera.overlay(dark, aj.camera.detect(dark, board))
+        >>> picture[6:10]
+        b'JFIF'
     """
     require("camera", "A picture of detected corners")
     import cv2

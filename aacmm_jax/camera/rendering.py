@@ -33,6 +33,10 @@ class Optics(NamedTuple):
         shading: Largest share of light that is missing, at one side of the image.
         black: Grey level of what is printed black.
         white: Grey level of the paper.
+
+    Example:
+        >>> aj.camera.Optics(blur=1.5).noise
+        2.0
     """
 
     blur: NotNegative = 0.8
@@ -133,7 +137,7 @@ def _paint(
     left, upper, right, lower = box
     fine = [(np.arange((end - first) * _SAMPLES) + 0.5) / _SAMPLES - 0.5 + first for first, end in
             ((left, right), (upper, lower))]  # fmt: skip
-    direction = _directions(*fine, *camera)
+    direction = _directions(fine[0], fine[1], *camera)
     # A direction d meets the plane at coordinates a, b where d is parallel to frame (a, b, 1).
     a, b, c = np.tensordot(np.linalg.inv(frame), direction, axes=1)
     ahead = c > 0
