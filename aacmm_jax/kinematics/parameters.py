@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.arguments import NOT_EMPTY, NotNegative, Range, checked_arguments, checked_fields
+from ..core.arguments import NotNegative, Range, checked_arguments, checked_fields
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, to_jax
@@ -54,7 +54,7 @@ class Parameters(eqx.Module):
     """
 
     base: Arm  # from which fixed parameters are taken
-    names: Annotated[tuple[str, ...], NOT_EMPTY] = eqx.field(static=True)  # of the free ones
+    names: tuple[str, ...] = eqx.field(static=True)  # of the free ones; none of an arm that is taken as exact
 
     def __check_init__(self):
         checked_fields(self)
@@ -161,6 +161,9 @@ class Parameters(eqx.Module):
             )
         # Where values are known by NumPy, since every operation of JAX outside jit is a program to compile.
         tools: Any = np if is_concrete(*jax.tree.leaves(arm.geometry)) else jnp
+        if not self.names:
+            vector = tools.zeros((*tools.shape(arm.alpha)[:-1], 0))
+            return vector if namespace(arm) is np else to_jax(vector)
         kinds = {kind: getattr(arm, kind) for kind, _ in self.indices()}
         values = {kind: tools.asarray(0.0 * arm.alpha if array is None else array) for kind, array in kinds.items()}
         rows = tools.broadcast_arrays(*(values[kind][..., i] for kind, i in self.indices()))

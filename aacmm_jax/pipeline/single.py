@@ -234,7 +234,7 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
 
 def _check_identifiable(capture: Capture, bounds: Bounds, prior: Prior | None, strict: bool) -> None:
     """Warn of, or with ``strict`` refuse, free parameters that these data cannot determine; not of traced values."""
-    if inside_trace() or not is_concrete(*jax.tree.leaves((capture, bounds))):
+    if not bounds.space.names or inside_trace() or not is_concrete(*jax.tree.leaves((capture, bounds))):
         return
     space = bounds.space
     stated = prior and prior.of(space.names, space.vector())
