@@ -227,7 +227,7 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
         )
         if replaced is not result:
             return replaced
-    if case is not None and given.shared_errors:
+    if case is not None and given.shared_errors and bounds.space.names:
         result = shared_errors.amend(result, case, sensitivities)
     return to_jax(result)
 
