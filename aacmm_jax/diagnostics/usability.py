@@ -38,7 +38,7 @@ def test(case: Case) -> list[Finding]:
         findings.append(Finding("not-converged", record.reason, severity="unusable"))
     if record.residual > record.largest_usual_residual:
         findings.append(_of_residuals(case))
-    elif record.plausible_scale and many_on_bounds(record):
+    elif record.names and record.plausible_scale and many_on_bounds(record):
         sides, mistake = on_bounds(record), case.once(mistake_in_data)
         findings.append(
             Finding(

@@ -142,7 +142,7 @@ def with_best_model(record: CalibrationRecord, solve: Solve, recorded: Record, o
     alone, or where there are too few poses to hold some out."""
     recording = record.recording
     nominal, capture = recording.nominal, recording.capture
-    if record.observed.rms < EXACT:  # simulated without noise
+    if record.observed.rms < EXACT or not record.names:  # simulated without noise, or only geometry was identified
         return record
     bounds = nominal.bounds()
 

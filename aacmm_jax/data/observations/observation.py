@@ -88,6 +88,9 @@ class AbstractObservation(Declared):
     derived: ClassVar[tuple[str, ...]] = ()  # fields of `completed` that are no entries
     rotates: ClassVar[bool] = False  # whether the residual depends on the rotation of the last frame
     stacks: ClassVar[bool] = True  # whether it can be evaluated together with others of the kind: see `alike`
+    # Whether geometry that no other observation uses is eliminated; else it stands beside the arm's parameters, so that
+    # there is something to solve for where no parameter is free.
+    eliminates: ClassVar[bool] = True
     # Whether the residual is linear in all unknowns, with derivatives that do not depend on tips and unknowns.
     linear: ClassVar[bool] = False
     fixes_scale: bool = False  # whether it determines the scale of the arm

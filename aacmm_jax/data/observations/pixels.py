@@ -59,7 +59,7 @@ class Pixels(AbstractObservation):
         ['frame of board', 'orientation of webcam']
     """
 
-    kind, table, rotates, stacks = "pixels", "pixels", True, False
+    kind, table, rotates, stacks, eliminates = "pixels", "pixels", True, False, False
     fixes_scale = True
     derived = ("still", "unsure")
     corners: Float[AnyArray, "m c d"] = declared(
