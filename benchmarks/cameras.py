@@ -1,10 +1,10 @@
 """Cameras: mounts against OpenCV's methods, intervals, the time of a calibration, and an arm that a webcam calibrates.
 
-    python benchmarks/cameras.py hand-eye [trials]     # 15 and 40 poses, exact arm, noise 0.3 px, known intrinsics
-    python benchmarks/cameras.py intrinsics            # against cv2.calibrateCamera
-    python benchmarks/cameras.py coverage [trials]     # of 95 % intervals, camera on the arm and fixed
-    python benchmarks/cameras.py time                  # 100 poses of 60 corners, everything free
-    python benchmarks/cameras.py webcam [arms]         # a 5-joint arm, servo zeros off by 1 deg, links by 1 mm
+python benchmarks/cameras.py hand-eye [trials]     # 15 and 40 poses, exact arm, noise 0.3 px, known intrinsics
+python benchmarks/cameras.py intrinsics            # against cv2.calibrateCamera
+python benchmarks/cameras.py coverage [trials]     # of 95 % intervals, camera on the arm and fixed
+python benchmarks/cameras.py time                  # 100 poses of 60 corners, everything free
+python benchmarks/cameras.py webcam [arms]         # a 5-joint arm, servo zeros off by 1 deg, links by 1 mm
 """
 
 import sys
@@ -118,8 +118,12 @@ def coverage(trials=1000):
         inside, start = {}, time.process_time()
         for seed in range(trials):
             nominal = aj.perturbed_arm(true, space, length=1.0, angle=0.003, seed=seed)
-            bounds = aj.Bounds.around(nominal, space.based_on(nominal) if hasattr(space, "based_on") else
-                                      aj.Parameters(nominal, names), length=10.0, angle=0.03)
+            bounds = aj.Bounds.around(
+                nominal,
+                space.based_on(nominal) if hasattr(space, "based_on") else aj.Parameters(nominal, names),
+                length=10.0,
+                angle=0.03,
+            )
             capture = seen(true, 25, seed, on_arm, noise, points=grid(5, 4, 40.0), u_intrinsics=np.inf)
             result = aj.calibrate(nominal, capture, bounds, noise=noise)
             (eye,) = capture.observations

@@ -54,7 +54,7 @@ class Parameters(eqx.Module):
     """
 
     base: Arm  # from which fixed parameters are taken
-    names: tuple[str, ...] = eqx.field(static=True)  # of the free ones; none of an arm that is taken as exact
+    names: tuple[str, ...] = eqx.field(static=True)  # of the free ones; none where only geometry is identified
 
     def __check_init__(self):
         checked_fields(self)
@@ -96,8 +96,6 @@ class Parameters(eqx.Module):
             arm = arm.replace(beta=jnp.zeros_like(arm.alpha))
         usual = [name for name in parameter_names(arm) if name in free or not name.startswith(("beta_", "gravity_"))]
         wanted = tuple(name for name in usual if name not in held)
-        if not wanted:
-            raise InputError("every parameter is held, so nothing is left to identify; hold fewer parameters.")
         return cls(base=arm, names=wanted)
 
     @classmethod
@@ -161,13 +159,10 @@ class Parameters(eqx.Module):
             )
         # Where values are known by NumPy, since every operation of JAX outside jit is a program to compile.
         tools: Any = np if is_concrete(*jax.tree.leaves(arm.geometry)) else jnp
-        if not self.names:
-            vector = tools.zeros((*tools.shape(arm.alpha)[:-1], 0))
-            return vector if namespace(arm) is np else to_jax(vector)
         kinds = {kind: getattr(arm, kind) for kind, _ in self.indices()}
         values = {kind: tools.asarray(0.0 * arm.alpha if array is None else array) for kind, array in kinds.items()}
         rows = tools.broadcast_arrays(*(values[kind][..., i] for kind, i in self.indices()))
-        vector = tools.stack(rows, axis=-1)
+        vector = tools.stack(rows, axis=-1) if rows else tools.zeros((*arm.alpha.shape[:-1], 0))
         return vector if namespace(arm) is np else to_jax(vector)
 
     def arm(self, vector: Numbers) -> Arm:

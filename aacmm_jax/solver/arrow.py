@@ -65,7 +65,7 @@ class Arrow(NamedTuple):
         head, parts = self.split(vector)
         top, below = (self.head @ head[..., None])[..., 0], []
         for crossed, block, part in zip(self.crossed, self.private, parts, strict=True):
-            flat = _flat(crossed)
+            flat = crossed.reshape(*crossed.shape[:-3], -1, crossed.shape[-1])
             top = top + (part.reshape(*part.shape[:-2], 1, -1) @ flat)[..., 0, :]
             of_head = (flat @ head[..., None])[..., 0]
             below.append((block @ part[..., None])[..., 0] + of_head.reshape(part.shape))
@@ -83,7 +83,7 @@ class Arrow(NamedTuple):
             whitening = inverse_cholesky(_damped(block, still, damping[..., None]))
             crossed = xp.where(still[..., None] | head_fixed[..., None, None, :], 0.0, crossed)
             by_head, alone = whitening @ crossed, (whitening @ part[..., None])[..., 0]
-            flat = _flat(by_head)
+            flat = by_head.reshape(*by_head.shape[:-3], -1, by_head.shape[-1])
             transposed = xp.swapaxes(flat, -1, -2)
             head = head - transposed @ flat
             head_right = head_right - (transposed @ alone.reshape(*alone.shape[:-2], -1)[..., None])[..., 0]
@@ -114,12 +114,6 @@ def joined(head: Float[AnyArray, "*batch h"], *parts: Float[AnyArray, "*batch _ 
         return head
     flat = [part.reshape(*part.shape[:-2], -1) for part in parts]
     return namespace(head, parts).concatenate([head, *flat], axis=-1)
-
-
-def _flat(crossed: Float[AnyArray, "*batch K k h"]) -> Float[AnyArray, "*batch _ h"]:
-    """The blocks below each other; the head may be empty, so that their size cannot be left to the array."""
-    *batch, count, size, height = crossed.shape
-    return crossed.reshape(*batch, count * size, height)
 
 
 def _damped(

@@ -60,7 +60,8 @@ class Pixels(AbstractObservation):
         ['frame of board', 'orientation of webcam']
     """
 
-    kind, table, rotates, reduces, stacks = "pixels", "pixels", True, True, False
+    kind, table, rotates, reduces = "pixels", "pixels", True, True
+    stacks, eliminates = False, False
     fixes_scale = True
     derived = ("still", "unsure")
     corners: Float[AnyArray, "m c d"] = declared(
