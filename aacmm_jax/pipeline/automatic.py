@@ -51,6 +51,7 @@ _BETTER = 2.0  # the factor by which leaving out poses must reduce the residual
 _MOST = 0.5  # part of the excess of the residuals that a cause explains, from which it explains most of them
 _PLAIN = "dh"
 _SOME, _FUNCTIONS = "harmonics=1-6", "functions"
+_NOTICED = 1.03  # times the errors of the arm alone in held-out regions, from which a model is not taken
 _WORTH = 10.0  # log evidence that a richer model must add for a still richer one to be tried
 
 
@@ -200,8 +201,7 @@ def with_best_model(record: CalibrationRecord, solve: Solve, recorded: Record, o
     """The calibration with the model of the joints that predicts held-out regions best; as it is where that is the arm
     alone, where there are too few poses to hold some out, or where a wrong certified value explains most of the
     residuals: a model would only describe what that does to the arm."""
-    recording = record.recording
-    nominal, capture = recording.nominal, recording.capture
+    recording, nominal = record.recording, record.recording.nominal
     if record.observed.rms < EXACT:  # simulated without noise
         return record
     case = case_of(record)
@@ -210,12 +210,40 @@ def with_best_model(record: CalibrationRecord, solve: Solve, recorded: Record, o
         return record
     if not causes and lengths is not None and lengths.odd and lengths.probability < LEVEL:
         return record
-    bounds = nominal.bounds()
+    ladder = _ladder(recording, options)
+    if ladder is None:
+        return record
+    chosen, plain = ladder.recommended, ladder.models[0]
+    if chosen.model == _PLAIN or plain.model != _PLAIN or not chosen.result.converged:
+        return record
+    # Few regions cannot tell such a model from the best, but whoever asked for none would be served worse.
+    if chosen.rms_outside > _NOTICED * plain.rms_outside:
+        return record
+    better = chosen.rms_outside < plain.rms_outside
+    found = [cause.term for cause in causes if cause.kind == "term" and cause.term is not None]
+    terms = [term_text(term) for term in found if term.kind in all_sought() or term.term.correction is not None]
+    follow = f" Without it, residuals follow {shorten(terms, 3)}." if terms else ""
+    says = (
+        f"Model of the joints: {chosen.model}.{follow} In held-out regions its errors are {chosen.rms_outside:.3g} mm "
+        f"RMS, those of Denavit-Hartenberg parameters alone {plain.rms_outside:.3g} mm ({len(ladder.models)} models "
+        f"compared, {len(chosen.regions)} regions)."
+        + ("" if better else " As these hardly differ, the model that makes the measurements more probable was taken.")
+    )
+    corrected = chosen.result.space.base
+    modelled = recording._replace(nominal=nominal._replace(arm=corrected, prior=default_prior(corrected)))
+    again = recorded(chosen.result if options.shared_errors else solve(modelled), modelled)
+    return again._replace(removed=record.removed, decisions=(*record.decisions, says))
+
+
+def _ladder(recording: Recording, options: Any) -> ComparedModels | None:
+    """The default models as far as the data can carry them; None where there are too few poses to hold some out."""
+    nominal, capture, bounds = recording.nominal, recording.capture, recording.nominal.bounds()
 
     def compared(models: list[str]) -> ComparedModels:
         return compare_models(nominal.arm, capture, bounds, models=models, noise=options.noise)
 
     models = [model for model in default_models(nominal.arm, capture) if _FUNCTIONS not in model]
+    ladder: ComparedModels | None = None
     try:
         ladder = options.stage("Comparing models", lambda: compared(models))
         # Models with more functions of each joint take longer, and the next is tried only where the last explains more.
@@ -223,26 +251,12 @@ def with_best_model(record: CalibrationRecord, solve: Solve, recorded: Record, o
             before = max(ladder.models, key=lambda model: model.log_evidence)
             richer = _with_functions(before.model, functions)
             added = options.stage(f"Comparing models ({richer})", lambda model=richer: compared([model]))
-            ladder = ComparedModels((*ladder.models, *added.models))
+            ladder = ladder._replace(models=(*ladder.models, *added.models))
             if added.models[0].log_evidence < before.log_evidence + _WORTH:
                 break
     except (InputError, np.linalg.LinAlgError):  # too few poses to hold some out, or to fit that many functions
-        return record
-    chosen, plain = ladder.recommended, ladder.models[0]
-    if chosen.model == _PLAIN or not chosen.result.converged:
-        return record
-    found = [cause.term for cause in causes if cause.kind == "term" and cause.term is not None]
-    terms = [term_text(term) for term in found if term.kind in all_sought() or term.term.correction is not None]
-    follow = f" Without it, residuals follow {shorten(terms, 3)}." if terms else ""
-    says = (
-        f"Model of the joints: {chosen.model}.{follow} It predicts held-out regions to {chosen.rms_outside:.3g} mm "
-        f"RMS, where Denavit-Hartenberg parameters alone predict them to {plain.rms_outside:.3g} mm "
-        f"({len(ladder.models)} models compared, {len(chosen.regions)} regions)."
-    )
-    corrected = chosen.result.space.base
-    modelled = recording._replace(nominal=nominal._replace(arm=corrected, prior=default_prior(corrected)))
-    again = recorded(chosen.result if options.shared_errors else solve(modelled), modelled)
-    return again._replace(removed=record.removed, decisions=(*record.decisions, says))
+        pass
+    return ladder
 
 
 def _with_functions(model: str, functions: str) -> str:
