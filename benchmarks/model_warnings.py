@@ -38,7 +38,7 @@ FINDINGS = {
 # Those that only state how a capture is made.
 STATEMENTS = (
     "one-reference-length", "little-redundancy", "hardly-determined", "undetermined",
-    "outside-limits",
+    "outside-limits", "errors-of-places",
 )  # fmt: skip
 POSE_SETS = 8
 

@@ -7,14 +7,14 @@ Uncertainties are the tester's (artefacts, seat, fixture, temperature): the arm'
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
 from typing import Annotated, NamedTuple
 
 import jax
 import numpy as np
 
-from ..calibration.evaluation import evaluate
+from ..calibration.evaluation import Evaluation, evaluate
 from ..calibration.task import check_observed
 from ..core.arguments import Range, checked, checked_arguments
 from ..core.errors import InputError, nearest
@@ -25,6 +25,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.chain import Geometry
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..kinematics.workspace import arm_reach
+from ..model.layout import unknowns_of
 from ..model.observed import Observed
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .geometry import elbow_sides, points_of, unit_rows
@@ -203,6 +204,22 @@ class EvaluationRecord(NamedTuple):
         before = {} if as_found is None else {"as_found": as_found}
         return {"nominal": self.recording.nominal, **before, "calibrated": self.calibrated}
 
+    def evaluations(self, capture: Capture) -> dict[str, Evaluation]:
+        """These arms on a capture. Only the calibrated one is weighted by the noise of the calibration, and keeps
+        geometry: the nominal arm's errors are not that noise, and weighted by it, or with a geometry that is not its
+        own, its distances would not be the least that it reaches."""
+        noise, kept = None, None
+        if self.uncertainty is not None and capture.observations:
+            noise, kept = self.uncertainty.noise, self.uncertainty.kept
+        kept = None if kept is None else kept.select(Observed.of(capture, None).blocks)
+        geometry = None if kept is None else kept.parts
+        return {
+            stage: evaluate(specification.arm, capture, noise=noise, geometry=geometry)
+            if stage == "calibrated"
+            else evaluate(specification.arm, capture)
+            for stage, specification in self.arms().items()
+        }
+
     def held_out_lengths(self) -> list[int]:
         """Indices of the lengths with an end that the calibration was not identified from."""
         lengths = self.recording.capture.lengths
@@ -271,8 +288,12 @@ def _tests(record: EvaluationRecord | PointsRecord, measured: Measured) -> list[
     return [test for test in tests if test.standard in wanted or {m.name for m in test.metrics} & record.limits.keys()]
 
 
-def check_geometry(arm: Arm, capture: Capture) -> None:
-    """Raise `InputError` where observations do not determine their own unknowns."""
+def check_geometry(arm: Arm, capture: Capture, kept: Collection[str] = ()) -> None:
+    """Raise `InputError` where observations do not determine their own unknowns, except for parts that are kept."""
+    parts = [part for part in capture.observations if not set(unknowns_of(part)) <= set(kept)]
+    if not parts and not capture.names:
+        return
+    capture = Capture(capture.sockets, capture.lengths, parts) if len(parts) < len(capture.observations) else capture
     space = to_numpy(Parameters(arm, ("d_1",)))
     check_observed(Observed.of(capture, arm), space, np.asarray(space.vector()), 0)
 

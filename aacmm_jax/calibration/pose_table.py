@@ -24,13 +24,14 @@ from ..model.elimination import followed
 from ..model.layout import unknowns_of
 from ..model.observed import Observed
 from ..uncertainty.arm_uncertainty import Uncertainty
+from ..uncertainty.kept_geometry import KeptGeometry, fitted_geometry, head_of
 from ..uncertainty.linearisation import Linearisation, ObservationRows
 from ..uncertainty.shared_kinds import SUCCESSIVE, VISITS
 from .evaluation import fit_geometry
 from .task import without_lengths
 
 USED, HELD_OUT = "used", "held out"
-_NULL = 1e-10  # eigenvalues of the information on the shared geometry below this, of the largest, are zero
+_NULL = 1e-10  # eigenvalues of the information on the parameters below this, of the largest, are zero
 _LEAST = 1e-6  # mm: smallest standard uncertainty of what is certified
 
 
@@ -80,7 +81,10 @@ def residuals_by_pose(
         The residuals in the order of the capture; poses are numbered within it.
     """
     model, uncertainty = len(uncertainty.names), to_numpy(to_numpy(uncertainty).complete)
-    observed = to_numpy(Observed.of(without_lengths(capture), uncertainty.arm))
+    kept_names = () if uncertainty.kept is None else uncertainty.kept.names
+    observed = to_numpy(Observed.of(without_lengths(capture), uncertainty.arm, shared=kept_names))
+    held = None if uncertainty.kept is None else uncertainty.kept.select(observed.blocks)
+    geometry = geometry if held is None else {**geometry, **held.parts}
     noise, space = noise_of_poses(uncertainty), uncertainty.space
     given = {name: np.asarray(geometry[name], dtype=float) for name in observed.blocks if name in geometry}
     if len(given) < len(observed.blocks):
@@ -95,13 +99,14 @@ def residuals_by_pose(
     weights = [np.concatenate([fitted[observed.slices[number]] for number in group.members]).astype(float)
                for group in observed.layout.groups]  # fmt: skip
     linear = linear._replace(weights=[*weights, *linear.weights[len(weights) :]])
-    *derivatives, information = _derivatives(linear)
+    *derivatives, information = _derivatives(linear, held)
     of_used = _covariance_of_used(uncertainty, information[:model, :model])
+    of_kept = np.zeros((0, 0)) if held is None else np.asarray(held.covariance)
     rows = []
     for part, by_parameters, by_geometry in zip(linear.parts(), *derivatives, strict=True):
         masks = used[part.poses], fitted[part.poses]
         derivatives = np.asarray(by_parameters), np.asarray(by_geometry)
-        rows.append(_of_part((uncertainty, of_used), part, masks, *derivatives))
+        rows.append(_of_part((uncertainty, of_used, of_kept), part, masks, *derivatives))
     return _concatenated(rows)
 
 
@@ -125,52 +130,51 @@ def noise_of_poses(uncertainty: Uncertainty) -> Noise:
     return eqx.tree_at(lambda n: n.seating, noise, np.hypot(noise.seating, shared.sd_of(VISITS, SUCCESSIVE)))
 
 
-def _derivatives(linear: Linearisation) -> tuple[list[AnyArray], list[AnyArray], np.ndarray]:
-    """Of the whitened rows of each observation, with the poses last: A, by mm and rad of the parameters; and G times a
-    root of F. And the information on the parameters, in natural steps."""
-    influence, observed, p = linear.influence(), linear.observed, len(linear.space.names)
-    information = np.asarray(influence.information)
-    values, vectors = np.linalg.eigh(information[p:, p:])
-    large = values > _NULL * values.max(initial=0.0)
-    root = vectors[:, large] / np.sqrt(values[large])  # of F, for the geometry that several observations share
-    follow = root @ (root.T @ information[p:, :p])
+def _derivatives(linear: Linearisation, kept: KeptGeometry | None) -> tuple[list[AnyArray], list[AnyArray], np.ndarray]:
+    """Of the whitened rows of each observation, with the poses last: A, by mm and rad of the numbers that are kept and
+    of the parameters; and G times a root of F. And the information on the parameters, in natural steps."""
+    influence, observed, head = linear.influence(), linear.observed, head_of(linear, kept)
+    root, follow = fitted_geometry(influence, head)
     by_parameters, by_geometry = [], []
     for number in range(len(observed.layout.groups)):
-        rows = np.asarray(influence.rows[number])
-        by = rows[:p] - np.einsum("gp,grm->prm", follow, rows[p:])
-        by_parameters.append(by / np.asarray(linear.space.scale)[:, None, None])
-        of_geometry, own = [np.einsum("gb,grm->brm", root, rows[p:])], influence.own_rows(number)
+        fitted, given = head.split(np.asarray(influence.rows[number]))
+        by_parameters.append(given - np.einsum("gp,grm->prm", follow, fitted))
+        of_geometry, own = [np.einsum("gb,grm->brm", root, fitted)], influence.own_rows(number)
         if own is not None:
             block = influence.blocks[number]
             values, vectors = np.linalg.eigh(np.asarray(influence.d_inverses[block.class_index]))
             roots = np.sqrt(np.maximum(values, 0.0))[:, None, :] * vectors
             of_geometry.append(np.asarray(followed(np.asarray(own), roots, block.sizes)))
         by_geometry.append(np.concatenate(of_geometry))
-    on_parameters = information[:p, :p] - information[:p, p:] @ follow
+    steps, information = np.asarray(linear.space.scale), np.asarray(influence.information) @ head.given
+    whole = head.given.T @ information - information[head.fitted].T @ follow
+    on_parameters = np.outer(steps, steps) * whole[-len(steps) :, -len(steps) :]
     return observed.by_observation(by_parameters), observed.by_observation(by_geometry), on_parameters
 
 
 def _of_part(
-    covariances: tuple[Uncertainty, Float[np.ndarray, "p p"]],
+    covariances: tuple[Uncertainty, Float[np.ndarray, "p p"], Float[np.ndarray, "k k"]],
     part: ObservationRows,
     masks: tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " m"]],
-    by_parameters: Float[np.ndarray, "p r m"],
+    by_parameters: Float[np.ndarray, "q r m"],
     by_geometry: Float[np.ndarray, "g r m"],
 ) -> PoseResiduals:
-    """The poses of one observation. ``covariances`` are those of the parameters for held-out and for used poses,
-    ``masks`` the poses that the arm, and those that the geometry was fitted to."""
+    """The poses of one observation. ``covariances`` are those of the parameters for held-out and for used poses, and of
+    the geometry that is kept; ``masks`` the poses that the arm, and those that the geometry was fitted to."""
     observation, by_tip, (used, fitted) = part.observation, np.asarray(part.by_tip), masks
     values, m = np.asarray(part.values), len(used)
     position, moved = (np.asarray(observation.in_mm(rows, by_tip)) for rows in (values, by_tip))
     to_mm = np.moveaxis(np.linalg.inv(np.asarray(part.root)), 0, -1)
     to_mm = np.moveaxis(np.asarray(observation.in_mm(to_mm, by_tip)), -1, 0)
     a, g = np.moveaxis(by_parameters, -1, 0).swapaxes(1, 2), np.moveaxis(by_geometry, -1, 0).swapaxes(1, 2)
-    by_arm, by_place = to_mm @ a, to_mm @ g
+    by_arm, by_place, count = to_mm @ a, to_mm @ g, len(covariances[2])
+    by_arm, by_kept = by_arm[..., count:], by_arm[..., :count]
     of_arm = np.empty((m, by_arm.shape[1], by_arm.shape[1]))
     of_arm[used] = rows_times(by_arm[used], covariances[1]) @ by_arm[used].swapaxes(1, 2)
     of_arm[~used] = covariances[0].covariance_of_functions(by_arm[~used])
     of_place = np.where(fitted, -1.0, 1.0)[:, None, None] * (by_place @ by_place.swapaxes(1, 2))
-    variances = to_mm @ to_mm.swapaxes(1, 2) + of_arm + of_place
+    of_kept = by_kept @ covariances[2] @ by_kept.swapaxes(1, 2)
+    variances = to_mm @ to_mm.swapaxes(1, 2) + of_arm + of_place + of_kept
     u = np.sqrt(np.maximum(np.einsum("mcc->m", variances), 0.0))
     angle, pixels = (
         np.linalg.norm(values[observation.lengths :], axis=0) if observation.other_unit == unit else np.full(m, np.nan)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import block_diag
 
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..data.capture import Capture
@@ -24,6 +25,7 @@ from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.between_groups import BetweenGroups
 from ..uncertainty.coverage import LEVEL
 from ..uncertainty.degrees_of_freedom import Law, coverage_factor, degrees_of_freedom
+from ..uncertainty.kept_geometry import KeptGeometry, head_of
 from ..uncertainty.linear_propagation import Influence
 from ..uncertainty.linearisation import Linearisation, ObservationRows
 from ..uncertainty.shared_kinds import PLACES
@@ -147,7 +149,9 @@ class _Unseen(NamedTuple):
     With whitened derivatives A by the parameters and G by the geometry, and U an orthonormal basis of G, errors dp of
     the parameters and w of the rows leave K (A dp + w) with K = I - U U^T. In mm, with D the inverse of the whitening,
     V = D (K + K A C A^T K) D^T = D (I + W S W^T) D^T, where W = [U, K A] and S = diag(-I, C). The part of U for one
-    observation's own geometry concerns that observation alone.
+    observation's own geometry concerns that observation alone. Geometry that is kept is not in G: with the derivatives
+    O by its numbers, which follow the parameters and have the covariance F for given parameters (`kept_geometry`),
+    W = [U, K O, K (A + O dk/dx)] and S = diag(-I, F, C).
     """
 
     uncertainty: Uncertainty
@@ -158,30 +162,31 @@ class _Unseen(NamedTuple):
     joined: Sequence[Float[AnyArray, "w _ _"]]  # W but for these: of the shared geometry, and K A
     common: Float[np.ndarray, "w w"]  # S for these
     basis: Float[np.ndarray, "s b"]  # of the shared geometry's numbers, with which its columns are orthonormal
-    along: Float[np.ndarray, "b p"]  # components of A along them
+    along: Float[np.ndarray, "b q"]  # components of O and A along them
+    kept: KeptGeometry | None
 
     @classmethod
     def of(cls, uncertainty: Uncertainty, capture: Capture) -> "_Unseen":
         """Reference lengths take no part: they are to be measured."""
-        noise = noise_of_poses(uncertainty)
-        observed = to_numpy(Observed.of(without_lengths(capture), uncertainty.arm))
-        fitted = fit_geometry(uncertainty.arm, observed, {}, noise)
-        space, p = uncertainty.space, len(uncertainty.space.names)
+        noise, given = noise_of_poses(uncertainty), () if uncertainty.kept is None else uncertainty.kept.names
+        observed = to_numpy(Observed.of(without_lengths(capture), uncertainty.arm, shared=given))
+        kept = None if uncertainty.kept is None else uncertainty.kept.select(observed.blocks)
+        fitted = fit_geometry(uncertainty.arm, observed, {} if kept is None else kept.parts, noise)
+        space = uncertainty.space
         z = np.concatenate([np.asarray(space.vector()), np.asarray(fitted.geometry)])
         linear = Linearisation.at(observed, space, z, noise=noise, least=max(_LEAST * float(fitted.sigma), 1e-12))
         influence, groups = linear.influence(), len(observed.layout.groups)
-        of_shared = [np.asarray(rows)[p:] for rows in influence.rows]
-        of_parameters = [np.asarray(rows)[:p] / np.asarray(space.scale)[:, None, None] for rows in influence.rows]
+        head = head_of(linear, kept)
+        of_shared, of_given = zip(*(head.split(np.asarray(rows)) for rows in influence.rows), strict=True)
         values, vectors = np.linalg.eigh(sum(flat(rows) @ flat(rows).T for rows in of_shared))
         large = values > _NULL * values.max(initial=0.0)
         basis = vectors[:, large] / np.sqrt(values[large])
         of_shared = [np.einsum("sb,srm->brm", basis, rows) for rows in of_shared]
-        pairs = list(zip(of_shared, of_parameters, strict=True))
+        pairs = list(zip(of_shared, of_given, strict=True))
         along = np.sum([flat(b) @ flat(a).T for b, a in pairs], axis=0)
         joined = [np.concatenate([b, a - np.einsum("bp,brm->prm", along, b)]) for b, a in pairs[:groups]]
-        count, private = len(basis.T), []
-        common = np.zeros((count + p,) * 2)
-        common[:count, :count], common[count:, count:] = -np.eye(count), uncertainty.covariance
+        own = np.zeros((0, 0)) if kept is None else np.asarray(kept.covariance)
+        common, private = block_diag(-np.eye(len(basis.T)), own, uncertainty.covariance), []
         for number, block in enumerate(influence.blocks[:groups]):
             rows = influence.own_rows(number)
             if rows is None:
@@ -191,7 +196,7 @@ class _Unseen(NamedTuple):
             roots = np.sqrt(np.maximum(values, 0.0))[:, None, :] * vectors
             private.append(np.asarray(followed(np.asarray(rows), roots, block.sizes)))
         private, joined = observed.by_observation(private), observed.by_observation(joined)
-        return cls(uncertainty, linear, influence, linear.parts(), private, joined, common, basis, along)
+        return cls(uncertainty, linear, influence, linear.parts(), private, joined, common, basis, along, kept)
 
 
 def _part_of(problem: _Unseen, number: int, part: ObservationRows) -> _Part:
@@ -240,11 +245,15 @@ def _of_lengths(
             places += variance * by_place @ by_place.T
     head, components = observed.by_unknowns(by_geometry, p)
     by_head = np.asarray(influence.eliminated(head, components))
-    pull = by_head[:, p:] @ problem.basis
-    along = by_head[:, :p] / np.asarray(linear.space.scale) - pull @ problem.along
+    of_shared, of_given = head_of(linear, problem.kept).split(by_head.T)
+    pull = of_shared.T @ problem.basis
+    along = of_given.T - pull @ problem.along
     pairs = zip(components, influence.d_inverses, strict=True)
     scatter = np.sum([np.einsum("lKk,Kkj,gKj->lg", part, inverse, part) for part, inverse in pairs], axis=0)
-    covariance = uncertainty.covariance_of_functions(along) + scatter + pull @ pull.T + places + np.diag(u**2)
+    along, by_kept = along[:, along.shape[1] - p :], along[:, : along.shape[1] - p]
+    of_kept = 0.0 if problem.kept is None else by_kept @ np.asarray(problem.kept.covariance) @ by_kept.T
+    of_geometry = scatter + pull @ pull.T + of_kept
+    covariance = uncertainty.covariance_of_functions(along) + of_geometry + places + np.diag(u**2)
     error = np.asarray(measured) - np.array([float(length.value) for length in capture.lengths])
     # What they rest on: the parts of the calibration's uncertainty, of which the first contains the scatter of the
     # poses at the ends, errors of places there, and what is stated of lengths.

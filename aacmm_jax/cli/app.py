@@ -141,6 +141,18 @@ def progress_bar(*columns: Any, transient: bool = False) -> Iterator[Any]:
         yield bar
 
 
+def read_with_progress(manifest: Path) -> Any:
+    """The recording of a manifest, with a bar while images are read."""
+    from ..files.manifest import read_manifest
+
+    with progress_bar(transient=True) as bar:
+
+        def shown(items: Sequence[Any], what: str) -> Iterable[Any]:
+            return items if bar is None else bar.track(items, description=what)
+
+        return read_manifest(manifest, progress=shown)
+
+
 def show_summary(summary: dict[str, Any], as_json: bool, view: Callable[[dict[str, Any]], Iterable]) -> None:
     """Print a summary as JSON, or what people see of it."""
     if as_json:

@@ -16,7 +16,7 @@ from ..files.outputs import reading, together, write_text
 from ..model.loss_names import LossName
 from ..uncertainty.coverage import LEVEL
 from . import options, views
-from .app import command, show_summary, with_spinner
+from .app import command, read_with_progress, show_summary, with_spinner
 from .options import argument, flag, names_option, option, output, seed
 
 
@@ -87,6 +87,11 @@ def calibrate(
     held: str | None = option(
         "Hold these parameters at their nominal values (names separated by commas). Default: the list in the arm file.",
         "NAMES",
+    ),
+    arm_fixed: bool = flag(
+        "--arm-fixed",
+        "Hold all parameters of the arm at their nominal values: identify only the geometry, such as the mount of a "
+        "camera (hand-eye calibration).",
     ),
     free: str | None = option(
         "Also identify these parameters (names separated by commas), for example the Hayati angle beta_2.", "NAMES"
@@ -170,7 +175,7 @@ def calibrate(
         recording = _recording(capture, same_probe)
         recording = recording._replace(capture=recording.capture.select(only or None, without or ()))
         nominal = recording.nominal if model is None else with_model(recording.nominal, model)
-        nominal = _with_parameters(nominal, held, free)
+        nominal = _with_fixed_arm(nominal, held, free) if arm_fixed else _with_parameters(nominal, held, free)
         nominal = _bounded(nominal, length_bound_mm, angle_bound_deg, bound or [])
         if prior is not None:
             chosen = chosen._replace(prior=prior_of_text(prior, nominal.arm))
@@ -193,7 +198,7 @@ def _recording(paths: Sequence[Path], same_probe: bool) -> Any:
     sessions = {}
     for path in paths:
         if path.suffix == ".toml":
-            recording = files.read_manifest(path)
+            recording = read_with_progress(path)
         else:
             recording = files.load_capture(read := InputFile(path))
             recording = recording._replace(sources=(fingerprint(read), *recording.sources))
@@ -216,6 +221,17 @@ def _with_parameters(nominal: Any, held: str | None, free: str | None) -> Any:
         fixed = tuple(name for name in fixed if name not in freed)
     freed = [*(name for name in nominal.free if name not in (fixed or ())), *freed]
     return nominal._replace(held=fixed, free=tuple(dict.fromkeys(freed)), stated=tuple({*nominal.stated, "parameters"}))
+
+
+def _with_fixed_arm(nominal: Any, held: str | None, free: str | None) -> Any:
+    """The arm without a parameter to identify."""
+    from ..kinematics.arm import parameter_names
+
+    if held is not None or free is not None:
+        raise InputError("--arm-fixed holds all parameters; leave out --held and --free.")
+    return nominal._replace(
+        held=tuple(parameter_names(nominal.arm)), free=(), override={}, stated=tuple({*nominal.stated, "parameters"})
+    )
 
 
 def _bounded(nominal: Any, length_mm: float | None, angle_deg: float | None, bounds: Sequence[str]) -> Any:

@@ -12,7 +12,7 @@ from ..core.text import quoted
 from ..core.units import DEG
 from ..files.outputs import together
 from . import options, views
-from .app import command, show_summary, with_spinner
+from .app import command, read_with_progress, show_summary, with_spinner
 from .arm_command import checked_recording, reading_check
 from .options import argument, bad_option, flag, length_option, numbers_option, option, output, seed, sockets_option
 
@@ -155,7 +155,7 @@ def import_(
             "no output file is given; give -o FILE.h5 to write a capture, or --check to check the readings only."
         )
     with together(output):
-        recording = files.read_manifest(manifest)
+        recording = read_with_progress(manifest)
         summary = summaries.calibration.capture_summary(recording)
         if output is not None:
             files.save_capture(output, recording, summary)

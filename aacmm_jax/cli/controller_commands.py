@@ -19,6 +19,7 @@ from .arm_command import first_frame
 from .options import argument, flag, names_option, numbers_option, option, output
 
 _FORMATS = {".urdf": "urdf", ".json": "json", ".csv": "csv", ".yaml": "ur", ".yml": "ur", ".py": "python"}
+_OF_CAMERA = ("camera-info", "joint-origin", "static-transform", "opencv", "matrix")
 _OF_ONE_ARM = ("toml", "urdf", "table", "ur", "python")
 
 
@@ -26,14 +27,34 @@ _OF_ONE_ARM = ("toml", "urdf", "table", "ur", "python")
     "aacmm export calibration.h5 --format toml -o arm.toml",
     "aacmm export calibration.h5 -o robot.urdf",
     "aacmm export calibration.h5 --format table --convention craig --units m-rad",
+    "aacmm export calibration.h5 --format camera-info --camera webcam -o webcam.yaml",
+    "aacmm export calibration.h5 --format joint-origin",
     "aacmm export calibration.h5 --format dcc --evaluation tests.h5 --about laboratory.toml -o certificate.xml",
 )
 def export(
     calibration: Path = options.CALIBRATION_FILE,
-    form: Literal["toml", "json", "csv", "dcc", "urdf", "table", "offsets", "ur", "python"] | None = option(
+    form: Literal[
+        "toml",
+        "json",
+        "csv",
+        "dcc",
+        "urdf",
+        "table",
+        "offsets",
+        "ur",
+        "python",
+        "camera-info",
+        "joint-origin",
+        "static-transform",
+        "opencv",
+        "matrix",
+    ]
+    | None = option(
         "toml: arm file; json: complete summary; csv: parameters; dcc: Digital Calibration Certificate (XML); urdf: "
         "the URDF of the nominal arm, with calibrated origins; table: D-H table (CSV); offsets: refitted zero offsets "
-        "of the joints only; ur: kinematics.yaml of Universal Robots; python: a program that needs only NumPy. "
+        "of the joints only; ur: kinematics.yaml of Universal Robots; python: a program that needs only NumPy; "
+        "camera-info: intrinsics of a camera (ROS, YAML); joint-origin, static-transform, opencv, matrix: frame of a "
+        "camera or target, as the fixed joint of a URDF, a command of ROS 2, YAML of OpenCV, or 4 x 4 matrix (mm). "
         "Default: the format of the output's extension (.urdf, .json, .csv, .yaml, .py), otherwise toml.",
         None,
         "--format",
@@ -46,6 +67,13 @@ def export(
     ),
     convention: Literal["standard", "craig"] | None = option("D-H convention for --format table. Default: standard."),
     units: Literal["mm-deg", "m-rad"] | None = option("Units for --format table. Default: mm-deg."),
+    camera: str | None = option(
+        "Camera to write, if the calibration has several: its name, or that of the observation.", "NAME"
+    ),
+    frame: Literal["mount", "place"] | None = option(
+        "Frame to write with the formats of frames: mount: what is on the arm (camera or target), in the flange or in "
+        "the tip link of the URDF; place: what stands still, in the base. Default: mount."
+    ),
     output: Path | None = output("File to write. Default: standard output.", "FILE", None),
     about: Path | None = options.ABOUT,
     evaluation: Path | None = option(
@@ -65,6 +93,10 @@ def export(
         )
     if (convention is not None or units is not None) and written_as != "table":
         raise InputError("--convention and --units apply to tables only; give --format table too.")
+    if (camera is not None or frame is not None) and written_as not in _OF_CAMERA:
+        raise InputError(f"--camera and --frame apply to cameras only; give --format {', '.join(_OF_CAMERA)} too.")
+    if frame is not None and written_as == "camera-info":
+        raise InputError("--frame does not apply to --format camera-info; leave it out.")
     notes: list[str] = []
     with together(output):
         record = files.load_calibration(read := InputFile(calibration))
@@ -87,6 +119,8 @@ def export(
                 base=first_frame(nominal),
             )
             notes = _left_out_of_table(record, specification.arm)
+        elif written_as in _OF_CAMERA:
+            text = _of_camera(record, written_as, camera, frame or "mount")
         elif written_as == "urdf":
             text, notes = _urdf(record, specification)
         else:
@@ -120,6 +154,39 @@ def _text(record: Any, specification: Any, form: str, calibrated: bool) -> str:
         return specification_toml(specification, source=source)
     title = ", ".join(part for part in (specification.name, source) if part)
     return files.python_program(specification.arm, title=title, base=first_frame(nominal))
+
+
+def _of_camera(record: Any, form: str, named: str | None, frame: str) -> str:
+    """Intrinsics of a camera, or the frame of what is on the arm or stands still."""
+    from ..files import camera_files
+
+    rows = summaries.cameras.camera_rows(record)
+    chosen = [row for row in rows if named in (None, row["camera"], row["observation"])]
+    names = list(dict.fromkeys(row["camera"] for row in chosen))
+    if len(names) != 1:
+        known = ", ".join(dict.fromkeys(row["camera"] for row in rows))
+        if not rows:
+            raise InputError(f"the calibration has no camera; choose another format than {form}.")
+        raise InputError(f"choose one camera with --camera: {known}.")
+    row, nominal = chosen[0], record.recording.nominal
+    if form == "camera-info":
+        values = np.array([number["value"] for number in row["intrinsics"]])
+        size = row["image_size_px"] and (int(row["image_size_px"][0]), int(row["image_size_px"][1]))
+        return camera_files.camera_info_yaml(row["camera"], camera_files.StoredCamera(row["model"], values, size))
+    part, parent = row[frame], "flange" if frame == "mount" else "base"
+    matrix = np.array(part["matrix_mm"])
+    if nominal.urdf is not None and frame == "mount":
+        parent = nominal.urdf.tip
+        matrix[:3, 3] -= np.asarray(nominal.arm.probe)  # the last frame is turned as the tip link
+    elif nominal.urdf is not None:
+        parent, matrix = nominal.urdf.base, first_frame(nominal) @ matrix
+    write = {
+        "joint-origin": camera_files.joint_origin,
+        "static-transform": camera_files.static_transform,
+        "opencv": camera_files.transform_storage,
+        "matrix": camera_files.matrix_text,
+    }
+    return write[form](parent, part["of"], matrix)
 
 
 def _left_out_of_table(record: Any, arm: Any) -> list[str]:

@@ -86,6 +86,12 @@ def evaluate(
     max_length_error_mm: float | None = option(
         "Exit with code 1 if the error of any length is larger than this.", min=0
     ),
+    keep: list[str] | None = option(
+        "Keep what the calibration found instead of fitting it to the capture: the position of the target on the arm "
+        "('target', if it was not remounted), or the frame of the instrument or artefact in the base frame ('frame', "
+        "if neither has moved). May be given twice.",
+        "[target|frame]",
+    ),
     residuals: Path | None = options.RESIDUALS,
     as_json: bool = options.JSON,
 ) -> None:
@@ -108,6 +114,7 @@ def evaluate(
         rule=rule,
         standards=acceptance,
         measuring_range=range_mm,
+        keep=tuple(keep or ()),
         maxima={name: value for name, value in maxima.items() if value is not None},
     )
     if residuals is not None and capture is None:

@@ -8,6 +8,7 @@ from ..core.text import pluralise, shorten
 from ..core.units import DEG, people_read, people_read_change
 from ..summaries import result_tables as tables
 from ..summaries import tables as words
+from ..summaries.camera_tables import camera_view, images_words
 from ..summaries.result_tables import BY_CONSTRUCTION, STAGES, listed_apart
 from ..summaries.tables import Line, Styled, Table, View, decimals_for, formatted, listed, number
 from ..uncertainty.coverage import LEVEL_IN_PERCENT, U_AT_LEVEL
@@ -92,6 +93,7 @@ def capture(summary: dict[str, Any]) -> View:
         stated = [f"{quantity['quantity']} {words.quantity_words(quantity)}" for quantity in quantities]
         if stated:
             yield f"{row['observation']}: {shorten(stated, _MOST_PARTS)}."
+    yield from images_words(summary.get("images") or ())
     slides = any("lowest_mm" in row for row in summary["ranges"])
 
     def reading(row: dict[str, Any], end: str) -> Any:
@@ -127,6 +129,7 @@ def calibration(summary: dict[str, Any]) -> View:
         u = summary["scale_u"] or 0.0
         yield f"Scale of stage 1: k = {summary['scale_k']:.{decimals_for(u, 8)}f}, u(k) = {u:.1e} ({anchor})"
     yield from words.warnings_of(summary)
+    yield from camera_view(summary)
     if summary["cross_validation"] is not None:
         yield from tables.validation_tables(summary["cross_validation"])
     if summary.get("sessions"):

@@ -58,6 +58,22 @@ def checked_sphere(sphere: ProbedSphere, columns: int | None = None) -> ProbedSp
     return checked
 
 
+class ReadImage(NamedTuple):
+    """What was found in an image of a target, or listed for it in a table.
+
+    Args:
+        observation: Name of the observation.
+        image: Name of the file, or number of the pose.
+        corners: Number of corners.
+        refused: Why the image is not used; empty where it is.
+    """
+
+    observation: str
+    image: str
+    corners: int
+    refused: str = ""
+
+
 class Recording(NamedTuple):
     """A capture with the nominal arm that recorded it and, for a simulation, the true one.
 
@@ -74,6 +90,9 @@ class Recording(NamedTuple):
         usual: Noise that the arm's file states, with which an estimated one is compared; None where it states none.
         as_found: The arm with the parameters that its controller had on arrival; None where they are not known. The
             nominal arm is not it, unless somebody says so.
+        stated: What somebody stated of how it is to be read, which no search for mistakes overrules: "columns", "sign",
+            "offset" and "unit" of the joint readings, "units" of measured points.
+        images: What was found in each image of a target.
 
     Example:
         >>> recorded = aj.Recording(capture, nominal, measured="2026-01-31")
@@ -92,3 +111,5 @@ class Recording(NamedTuple):
     measuring_range: float | None = None
     usual: ArmNoise | None = None
     as_found: ArmSpecification | None = None
+    stated: tuple[str, ...] = ()
+    images: tuple[ReadImage, ...] = ()

@@ -8,10 +8,12 @@ from ..core.text import shorten
 from ..core.units import ARCSEC
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .culprits import Culprit, culprits_of
+from .determined import effect_of_bounds
 from .findings import Case, Finding, chance_text, rounded
 from .missing_terms import FoundTerm, wider_model
 
 ORDER, NEEDS = 60, "fit"
+_SEVERAL = 3  # steps at different poses, from which they are no single events
 
 
 def test(case: Case) -> list[Finding]:
@@ -19,9 +21,10 @@ def test(case: Case) -> list[Finding]:
     by_kind: dict[str, list[Culprit]] = {}
     for culprit in culprits_of(case):
         by_kind.setdefault(culprit.kind, []).append(culprit)
-    findings = []
+    # Of what bounds leave that parameters have reached.
+    findings, beside_bounds = [], 1 - case.once(effect_of_bounds).share
     for kind, culprits in by_kind.items():
-        explains = min(sum(culprit.explains for culprit in culprits), 1.0)
+        explains = min(sum(culprit.explains for culprit in culprits), 1.0) * beside_bounds
         if kind == "term":
             findings.append(_of_terms(case, [c.term for c in culprits if c.term is not None], explains))
             continue
@@ -30,16 +33,22 @@ def test(case: Case) -> list[Finding]:
     return findings
 
 
+def term_text(term: FoundTerm) -> str:
+    """What residuals follow, and how large it is."""
+    if term.term.relative and term.kind != "zero":
+        return f"{term.term.follows} ({rounded(100 * term.amplitude)} %)"
+    unit, size = ("mm", 1.0) if term.joint is None else ("arcsec", ARCSEC)
+    return f"{term.term.follows} ({rounded(term.amplitude / size)} {unit})"
+
+
 def _of_terms(case: Case, terms: Sequence[FoundTerm], explains: float) -> Finding:
     """Terms that the model lacks, in one finding: each explains what those before it leave."""
-    texts = []
-    for term in terms:
-        if term.term.relative and term.kind != "zero":
-            amplitude = f"{rounded(100 * term.amplitude)} %"
-        else:
-            unit, size = ("mm", 1.0) if term.joint is None else ("arcsec", ARCSEC)
-            amplitude = f"{rounded(term.amplitude / size)} {unit}"
-        texts.append(f"{term.term.follows} ({amplitude})")
+    events = [term for term in terms if term.term.first >= 0]
+    texts = [term_text(term) for term in terms]
+    if len(events) >= _SEVERAL:
+        # Of one event, all is said; of several, what they have in common: that something was not firm.
+        texts = [term_text(term) for term in terms if term.term.first < 0]
+        texts.append(f"{len(events)} changes from one pose to the next, first {term_text(events[0])}")
     named = {term.term.follows for term in terms}
     likely = [text for text in dict.fromkeys(other.follows for term in terms for other in term.others)]
     likely = [text for text in likely if text not in named]
@@ -131,10 +140,25 @@ def _of_scatter(culprits: Sequence[Culprit]) -> Finding:
     )
 
 
+def _of_stated(culprits: Sequence[Culprit]) -> Finding:
+    names = [culprit.name for culprit in culprits]
+    texts = [f"{culprit.name} (residuals {np.sqrt(culprit.size):.2g} times as large)" for culprit in culprits]
+    return Finding(
+        "u-too-small",
+        f"The stated u is too small: {shorten(texts)}.",
+        "These values have too much weight.",
+        "State the u that the instrument reaches in such poses.",
+        severity="doubt",
+        doubt=f"the stated u is too small: {shorten(names, 3)}",
+        concerns=tuple(names),
+    )
+
+
 _FINDINGS: dict[str, Callable[[Sequence[Culprit]], Finding]] = {
     "pose": _of_poses,
     "fixed": _of_fixed,
     "certified": _of_values,
     "noisy joint": _of_joints,
     "scatter": _of_scatter,
+    "stated u": _of_stated,
 }

@@ -27,12 +27,11 @@ from .findings import Case, by_equations, rounded
 from .hypotheses import fixed_text, pose_names, shifted_seats, steps
 from .missing_terms import FoundTerm, columns_of, missing_terms
 from .possible_causes import Cause, of_certified, of_functions, of_parameters, of_variances
-from .residual_tests import LEVEL, PRESENT, Candidates, Residuals, ScoreTest, Studentised, studentised
+from .residual_tests import LEVEL, PRESENT, SURE, Candidates, Residuals, ScoreTest, Studentised, studentised
 
 MOST_CAUSES = 6  # that are looked for one after the other
 _MOST_POSES = 6  # besides these
 _AS_WELL = 6.0  # difference of the criterion below which another cause explains as much
-_LEVEL = LEVEL / 5  # of false alarms of each family besides that of functions
 # Part of the residuals. A step of a joint, 1 mrad, turns the residuals themselves by 1e-3 of their size, and so does
 # the frame of a station that imitates it: in what is left of its column after the frame, linear equations are wrong.
 _SECOND_ORDER = 3e-3
@@ -50,7 +49,7 @@ _FACTORS = np.geomspace(0.1, 1e4, 32)  # of variances, in units of what they add
 class Culprit(NamedTuple):
     """A cause that explains residuals."""
 
-    kind: str  # "term", "fixed", "pose", "certified", "noisy joint" or "scatter"
+    kind: str  # "term", "fixed", "pose", "certified", "noisy joint", "scatter" or "stated u"
     name: str  # what it concerns
     probability: float  # Bonferroni's: of all causes of its family
     explains: float  # of the excess of the squared residuals
@@ -257,7 +256,7 @@ class _Search:
             if not cause.named or (number_of_cause < len(of_relations) and of_relations[number_of_cause]):
                 continue
             probability = test.probability * number[cause.family]
-            if test.degrees_of_freedom[0] and probability < (LEVEL if cause.family == "function" else _LEVEL):
+            if test.degrees_of_freedom[0] and probability < (LEVEL if cause.family == "function" else SURE):
                 results.append(self._of_columns(cause, test, number[cause.family]))
         poses = [
             studentised(part, self.left, rows, private)
@@ -326,7 +325,7 @@ class _Search:
             return []
         ratio, gain, added, number = worst
         probability = f_tail(ratio, added, freedom - added)
-        if probability * len(self.names) >= _LEVEL:
+        if probability * len(self.names) >= SURE:
             return []
         test = ScoreTest(gain, ratio, (added, freedom - added), probability, np.zeros(added))
         cause = Cause("pose", "pose", self.names[number], row=number)
@@ -356,7 +355,7 @@ class _Search:
             best = int(np.argmax(twice))
             gain = float(twice[best]) * freedom / count
             probability = 0.5 * chi_square_tail(max(gain, 0.0), 1) * len(self.noises)
-            if probability < _LEVEL:
+            if probability < SURE:
                 share, penalty = 1 - np.exp(-gain / freedom), np.log(freedom) + 2 * np.log(len(self.noises))
                 factor = float(factors[best, 0])
                 results.append(_Result(cause, gain - float(penalty), probability, float(share), None, factor))

@@ -2,6 +2,7 @@
 few equations, and a single reference length."""
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,8 +12,10 @@ from ..core.text import shorten
 from ..kinematics.independence import SHARE_OF_BOUNDS
 from ..kinematics.parameters import Bounds, Parameters
 from ..uncertainty.identifiability import Observability, observability, rms_of_noise
-from .findings import Case, Finding
-from .usability import is_anchored, many_on_bounds, on_bounds
+from .equations import Block
+from .findings import Case, Finding, by_equations
+from .residual_tests import Candidates, Residuals
+from .usability import TRY_ALL, is_anchored, many_on_bounds, mistake_in_data, on_bounds
 
 ORDER, NEEDS = 85, "fit"
 _TOGETHER = 1e-3  # part of an undetermined direction, from which a parameter belongs to it
@@ -49,13 +52,19 @@ def test(case: Case) -> list[Finding]:
     traded = {name for trade_off in seen.trade_offs for name in trade_off.names}
     # Without an anchor all lengths slide to bounds in stage 1, which the scale fix undoes.
     sides = on_bounds(record, final=True) | (on_bounds(record) if is_anchored(record) else {})
-    findings = []
-    for code, (says, costs, advice) in _ON_BOUNDS.items():
+    many = many_on_bounds(record) and len(sides.keys() - traded) >= len(record.names) / 3
+    findings = [_many(case, sides)] if many else []
+    for code, (says, costs, advice) in _ON_BOUNDS.items() if not findings else ():
         names = [name for name in sides if (name in traded) == (code == "weak-on-bounds")]
-        if names and not many_on_bounds(record):
-            says = says.format(names=shorten([f"{name} ({sides[name]})" for name in names]))
-            doubt = f"on a bound: {shorten(sorted(names), 3)}"
-            findings.append(Finding(code, says, costs, advice, "doubt", doubt, concerns=tuple(names)))
+        if not names:
+            continue
+        effect = case.once(effect_of_bounds) if code == "on-bounds" else Effect({}, 0.0)
+        names.sort(key=lambda name: -effect.gains.get(name, 0.0))
+        says = says.format(names=shorten([f"{name} ({sides[name]})" for name in names]))
+        doubt = f"on a bound: {shorten(names, 3)}"
+        finding = Finding(code, says, costs, advice, "doubt", doubt, concerns=tuple(names))
+        # Where a fixed length sets another scale than the lengths, that is what takes the others to their bounds.
+        findings.append(finding._replace(explains=None if record.scale_set_by else effect.share or None))
     findings += [*_redundancy(record), *(Finding("undetermined", sentence) for sentence in seen.sentences())]
     # Named above are those that the same capture could not determine without noise either, and near-degenerate ones.
     open_parts = np.flatnonzero(np.abs(seen.null).max(axis=1, initial=0.0) > _TOGETHER)
@@ -76,6 +85,46 @@ def test(case: Case) -> list[Finding]:
             )
         )
     return findings
+
+
+def _many(case: Case, sides: dict[str, str]) -> Finding:
+    """So many parameters that the data determine are on a bound that the arm is not that of the data."""
+    return Finding(
+        "many-on-bounds",
+        f"{len(sides)} of {len(case.record.names)} parameters are on a bound, so either the bounds are too narrow, or "
+        "the data do not match the arm.",
+        advice=case.once(mistake_in_data) or f"Widen the bounds (--length-bound-mm, --angle-bound-deg). {TRY_ALL}",
+        severity="doubt",
+        doubt=f"on a bound: {shorten(sorted(sides), 3)}",
+        concerns=tuple(sides),
+    )
+
+
+class Effect(NamedTuple):
+    """What bounds do to the residuals."""
+
+    gains: dict[str, float]  # parameter on a bound -> drop of the sum of squares if this bound were wider
+    share: float  # of the sum of squares that all these bounds explain
+
+
+@by_equations
+def effect_of_bounds(case: Case) -> Effect:
+    """What the parameters that ended on a bound would explain if they were free."""
+    free = [name for name in case.record.names if name != case.equations.anchor]
+    columns = [free.index(name) for name in on_bounds(case.record, final=True) if name in free]
+    if not case.testable or not columns:
+        return Effect({}, 0.0)
+    rows, relations = case.chunks
+    blocks = [*(part.block("") for part in rows), *relations]
+    without = Residuals.of([_without(block, columns) for block in blocks])
+    by = np.concatenate([block.shared[:, columns] for block in blocks])
+    tests = Candidates.of(without, [by[:, [i]] for i in range(len(columns))]).tests(without)
+    gains = {free[i]: test.gain for i, test in zip(columns, tests, strict=True)}
+    return Effect(gains, 1 - case.left.cost / max(without.cost, 1e-300))
+
+
+def _without(block: Block, columns: list[int]) -> Block:
+    return block._replace(shared=np.delete(block.shared, columns, axis=1))
 
 
 def _redundancy(record: CalibrationRecord) -> Iterator[Finding]:

@@ -197,6 +197,7 @@ class Rows(NamedTuple):
     # What makes of the residual a vector in mm whose length is the tip's distance from the geometry.
     in_mm: Float[np.ndarray, "m c r"]
     by_tip: Float[np.ndarray, "m r 3"]  # derivatives by the tip's position
+    measured: Float[np.ndarray, "m r r"]  # errors of what was measured, by independent ones of its rows
     poses: Int[np.ndarray, " m"]  # their numbers among all poses: sockets first, then other observations
 
     def block(self, group: str | None, extra: Sequence[int] = (), concerned: bool = True) -> Block:
@@ -213,7 +214,7 @@ class Rows(NamedTuple):
         """The same poses in standard deviations of another noise, whose covariance is given in those of the present."""
         factor = np.linalg.cholesky(0.5 * (covariance + covariance.swapaxes(1, 2)))
         root = np.linalg.inv(factor)
-        columns = {name: root @ getattr(self, name) for name in ("shared", "private", "extra", "by_tip")}
+        columns = {name: root @ getattr(self, name) for name in ("shared", "private", "extra", "by_tip", "measured")}
         residual = np.einsum("mab,mb->ma", root, self.residual)
         return self._replace(residual=residual, in_mm=self.in_mm @ factor, **columns)
 
@@ -289,6 +290,7 @@ def equations_of(record: CalibrationRecord) -> Equations:
                 by[..., columns],
                 np.moveaxis(in_mm, -1, 0),
                 root @ np.moveaxis(np.asarray(part.by_tip), -1, 0),
+                root @ _root_of(np.asarray(part.measured)),
                 np.arange(part.poses.start, part.poses.stop),
             )
         )
@@ -304,6 +306,14 @@ def equations_of(record: CalibrationRecord) -> Equations:
         relations.append(Block(PRIOR, None, residual, by, np.zeros((len(stated), 0))))
     natural = np.array([1.0 if is_length(name) else 1e-3 for name in extra])
     return Equations(rows, relations if len(u) else relations[1:], extra, natural, anchor)
+
+
+def _root_of(covariance: Float[np.ndarray, "m r r"]) -> Float[np.ndarray, "m r r"]:
+    """A matrix R with R R' the covariance, which may be singular; each column is of the unit of its row."""
+    sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[:, :, None]
+    safe = np.where(sd > 0, sd, 1.0)
+    values, vectors = np.linalg.eigh(covariance / safe / safe.swapaxes(1, 2))
+    return sd * (vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]) @ vectors.swapaxes(1, 2)
 
 
 def in_chunks(equations: Equations) -> tuple[list[Rows], list[Block]]:

@@ -3,8 +3,8 @@
 Of joint i, the model's angle is its reading and a zero. What it lacks is a further function phi of the readings, whose
 column is that of theta_i times phi: those of `kinematics.corrections` (harmonics of an eccentric, tilted or oval
 encoder, a wrong gear ratio, the moment of gravity about the axis where the joint or the link behind it bends), and a
-zero that drifts from pose to pose. A base that moves and an arm that grows, meanwhile or with its temperature, move the
-tip itself.
+zero that drifts from pose to pose, evenly or until it has settled. A base that moves and an arm that grows, meanwhile
+or with its temperature, move the tip itself.
 """
 
 from collections.abc import Sequence
@@ -29,6 +29,8 @@ _WORDS: dict[str, tuple[str, str]] = {
     "drifting base": ("a drift of the tip from pose to pose", "a base or socket that moves"),
     "growing arm": ("a growth of the arm from pose to pose", "an arm that warms or cools"),
 }
+# An arm that was just switched on warms up, and what it does dies away: after these parts of the capture, to 1 / e.
+_SETTLED, _SETTLING = (0.03, 0.1, 0.3), " that settles"
 
 
 class MissingTerm(NamedTuple):
@@ -117,16 +119,16 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
         return MissingTerm(kind, joint, values, relative, follows.format(i=joint), cause, concerns)
 
     words = {name: (sought.follows, sought.cause) for name, (_, sought) in all_sought().items()} | _WORDS
-    of_joints, of_tip = (
-        [],
-        [
-            named("drifting base", None, order[:, :, None] * np.eye(3)),
-            named("growing arm", None, order[:, :, None] * tip / 1e3),  # by 1 mm a m
-        ],
-    )
-    for joint in range(1, arm.joints + 1):
-        of_joints.append(named("zero", joint, np.ones_like(order), relative=True))
-        of_joints.append(named("drifting zero", joint, order))
+    of_joints, of_tip = [], []
+    for time, how in [(order, ""), *((np.exp(-(order + 1) / (2 * part)), _SETTLING) for part in _SETTLED)]:
+        drifts = [
+            named("drifting base", None, time[:, :, None] * np.eye(3)),
+            named("growing arm", None, time[:, :, None] * tip / 1e3),  # by 1 mm a m
+        ]
+        of_tip += [term._replace(follows=term.follows + how) for term in drifts]
+        drifts = [named("drifting zero", joint, time) for joint in range(1, arm.joints + 1)]
+        of_joints += [term._replace(follows=term.follows + how) for term in drifts]
+    of_joints += [named("zero", joint, np.ones_like(order), relative=True) for joint in range(1, arm.joints + 1)]
     nominal = arm.geometry if arm.corrections is None else arm.corrections.nominal
     gravity = np.asarray(DOWN if arm.gravity is None else arm.gravity)
     for name, (kind, sought) in all_sought().items():

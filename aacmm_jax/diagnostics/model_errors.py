@@ -24,7 +24,7 @@ from .culprits import culprits_of, explained, missing, selection
 from .findings import Case, Finding, case_of, chance_text
 from .missing_terms import FoundTerm
 from .noisy_encoders import NoisyJoint, noisiest_joint
-from .residual_tests import LEVEL, Residuals, alike, form_test, in_succession
+from .residual_tests import LEVEL, SURE, Residuals, alike, form_test, in_succession
 from .scale import Lengths, lengths_of
 
 ORDER, NEEDS = 62, "fit"
@@ -210,8 +210,8 @@ def successive_of(case: Case) -> Successive | None:
 class ModelTests(NamedTuple):
     """All tests of one calibration; None and nothing where there is too little to test.
 
-    Each has its ``probability`` where nothing is wrong, already that of its whole family; below `LEVEL` it is a
-    finding.
+    Each has its ``probability`` where nothing is wrong, already that of its whole family; below `LEVEL`, of a noisy
+    joint below `SURE`, it is a finding.
     """
 
     misfit: Misfit | None = None
@@ -224,9 +224,10 @@ class ModelTests(NamedTuple):
     @property
     def warns(self) -> bool:
         """Whether something is wrong."""
-        tests = (self.misfit, self.lengths, self.noisy_joint, self.successive)
+        tests = (self.misfit, self.lengths, self.successive)
         significant = any(test.probability < LEVEL for test in tests if test is not None)
-        return bool(self.terms or self.noisy_observations or significant)
+        noisy = self.noisy_joint is not None and self.noisy_joint.probability < SURE
+        return bool(self.terms or self.noisy_observations or noisy or significant)
 
 
 def model_tests(

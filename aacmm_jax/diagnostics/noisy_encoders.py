@@ -29,7 +29,7 @@ from ..data.noise import Noise, one_arcsec
 from .culprits import MOST_CAUSES, culprits_of, explained
 from .equations import Block, Rows
 from .findings import Case, Finding, by_equations, chance_text, reading_text
-from .residual_tests import LEVEL, Residuals, chance_above_zero
+from .residual_tests import SURE, Residuals, chance_above_zero
 
 ORDER, NEEDS = 40, "scale"
 _ROUNDS = 50  # of Fisher scoring; usually 4 to 8
@@ -75,7 +75,7 @@ def test(case: Case) -> list[Finding]:
         )
     noisiest = None if record.implausible_residual else case.once(noisiest_joint)
     said = any(culprit.kind == "noisy joint" for culprit in culprits_of(case))
-    if noisiest is not None and noisiest.probability < LEVEL and not said:
+    if noisiest is not None and noisiest.probability < SURE and not said:
         findings.append(
             Finding(
                 "noisy-encoder",
@@ -241,7 +241,7 @@ def _noisiest(record: CalibrationRecord, equations: _Equations) -> tuple[NoisyJo
     """The joint, and the equations as the test weighted them."""
     joints = range(len(equations.unit))
     noisiest = equations.noisiest(joints)
-    if noisiest is None or noisiest.probability >= LEVEL or record.given_noise is not None:
+    if noisiest is None or noisiest.probability >= SURE or record.given_noise is not None:
         return noisiest, equations
     # The noise of the calibration comes from two moments; its seat is often 0, and then poses whose tip encoders move
     # little in some direction count too much there.
@@ -259,7 +259,7 @@ def noise_by_joint(case: Case) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
     if not case.scatters or case.left.degrees_of_freedom < _FEWEST:
         return None
     noisiest, now = case.once(_without_terms)
-    if noisiest is None or noisiest.probability >= LEVEL:
+    if noisiest is None or noisiest.probability >= SURE:
         return None
     equations = _Equations.of(record, *case.chunks)
     given, joints = record.given_noise is not None, len(equations.unit)
@@ -268,10 +268,10 @@ def noise_by_joint(case: Case) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
     j = noisiest.joint - 1
     loose = [part._replace(private=np.concatenate([part.private, part.extra[..., [j]]], axis=2)) for part in now.rows]
     within = now._replace(rows=loose).noisiest([j])
-    if within is None or within.probability >= LEVEL:
+    if within is None or within.probability >= SURE:
         return None
     noisy, u, others = [], np.zeros(0), list(range(joints))
-    while noisiest is not None and noisiest.probability < LEVEL and len(noisy) < joints - 1:
+    while noisiest is not None and noisiest.probability < SURE and len(noisy) < joints - 1:
         noisy.append(noisiest)
         others.remove(noisiest.joint - 1)
         groups = [[test.joint - 1] for test in noisy] + ([] if given else [others, [joints]])

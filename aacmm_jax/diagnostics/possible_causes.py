@@ -19,6 +19,7 @@ _MOST_GROUPS = 60
 _SEVERAL = 4  # lengths, from which they are compared with each other
 _FAR = 10.0  # residual of a length over the scatter of the others, from which it stands out in any case
 _APART = 0.01  # part of a fixed parameter's effect that no free one has, below which it is redundant
+_MEASURED = {"rad": "orientations", "px": "pixels"}
 _SMALL = 1e-9  # singular value, relative to the largest
 
 
@@ -109,7 +110,8 @@ def of_certified(case: Case) -> list[Cause]:
 
 
 def of_variances(case: Case, rows: Sequence[Rows]) -> list[Cause]:
-    """One encoder, or one socket or observation, that is noisier; and the seat, beside the encoders."""
+    """One encoder, or one socket or observation, that is noisier; the seat, beside the encoders; and what was measured
+    in rad or px, beside what was measured in mm."""
 
     def of_joint(joint: int) -> Callable[[Rows], np.ndarray]:
         return lambda part: part.extra[..., [joint]]
@@ -119,11 +121,19 @@ def of_variances(case: Case, rows: Sequence[Rows]) -> list[Cause]:
             np.eye(part.residual.shape[1]) * (part.name == name), (*part.residual.shape, part.residual.shape[1])
         )
 
+    def of_unit(name: str, among: np.ndarray) -> Callable[[Rows], np.ndarray]:
+        return lambda part: part.measured * among if part.name == name else 0.0 * part.measured
+
     if not case.shows_noise:
         return []
     joints = case.record.calibrated.arm.joints
     causes = [Cause("noisy joint", "noise", f"joint {j + 1}", of_noise=of_joint(j)) for j in range(joints)]
     causes.append(Cause("tip", "noise", "tip", of_noise=lambda part: part.by_tip))
+    for observation in case.record.recording.capture.observations:
+        others = np.array(observation.row_units) != "mm"
+        if 0 < others.sum() < len(others):
+            name = f"{_MEASURED[observation.row_units[-1]]} of {observation.name}"
+            causes.append(Cause("stated u", "noise", name, of_noise=of_unit(observation.name, others)))
     poses: dict[str, int] = {}
     for part in rows:
         poses[part.name] = poses.get(part.name, 0) + len(part.poses)

@@ -73,6 +73,18 @@ class Hypothesis(NamedTuple):
         return self.angle * q[:, list(self.order)] * np.array(self.signs) + np.array(self.offsets)
 
     @property
+    def changed(self) -> tuple[str, ...]:
+        """What it changes, as `Recording.stated` names it: columns, sign, offset, unit, units."""
+        of_each = {
+            "columns": self.order != tuple(sorted(self.order)),
+            "sign": min(self.signs) < 0,
+            "offset": any(self.offsets),
+            "unit": self.angle != 1,
+            "units": self.length != 1,
+        }
+        return tuple(name for name, differs in of_each.items() if differs)
+
+    @property
     def changes(self) -> int:
         """Number of mistakes that it names: units, signs, exchanges of two columns, zeros."""
         order, exchanges = list(self.order), 0

@@ -20,6 +20,7 @@ from ..core.linear_algebra import inverse_cholesky
 from .equations import Block, Rows
 
 LEVEL = 0.01  # of false alarms of one family of tests
+SURE = LEVEL / 5  # of those families that say what is wrong, of which there are many
 _NULL = 1e-5  # singular values of scaled columns below this, of the largest, are zero
 _MANY = 60  # columns, from which singular values are avoided where possible
 PRESENT = 1e-6  # part of a direction of a pose that the model leaves, below which nothing is left

@@ -19,6 +19,7 @@ from ..core.text import shorten
 from ..core.units import INCH, M
 from ..model.observed import Observed
 from ..uncertainty.shared_kinds import PLACES
+from .arm_size import KEPT, size_of, u_of_size
 from .culprits import culprits_of
 from .equations import EXACT, LEAST_U, PRIOR, Block, Rows, lengths_in_solve, linearisation_of, scale_anchor_of
 from .findings import Case, Finding, chance_text
@@ -38,8 +39,10 @@ _MISTAKEN_UNITS = {
 }
 # A length is named where chi-square falls below a ninth without it, to what chance exceeds in over 5 % of cases.
 _CLEAR, _AGREE = 9.0, 0.05
-_SET_BY = "scale-set-by-fixed-lengths"
+_FAR = 100.0  # or its gain is so many times the mean square of what is left without it
+_SET_BY, _FAR_FROM_1 = "scale-set-by-fixed-lengths", "scale-far-from-1"
 _MOST_U = 4.0  # standard uncertainties of k, beyond which what fixes the scale is wrong
+_PULLED = 0.5  # standard uncertainties of the scale, from which the noise of the poses shifts it too much
 _FEW = 2  # lengths, of which each may be the wrong one where they disagree
 
 
@@ -53,13 +56,17 @@ class Lengths(NamedTuple):
     odd: str = ""  # the one without which the others agree
     difference: float = 0.0  # of that one from what the others say, mm
     names: tuple[str, ...] = ()  # of all of them
+    by_u: float = 1.0  # the Birge ratio without shared errors
+    smaller: float = 1.0  # probability of a smaller one
 
 
 def test(case: Case) -> list[Finding]:
-    """Lengths that disagree, at most one finding on k, and one where the arm could not be divided by it."""
+    """Lengths that disagree, at most one finding on the scale, and one where the arm could not be divided by k."""
     record = case.record
     fits = record.plausible_scale and not record.implausible_residual
     of_lengths, of_k = _of_lengths(case) if fits else None, _of_k(record)
+    if fits and (of_k is None or of_k.code == _FAR_FROM_1):
+        of_k = _of_size(record) or _of_weak_scale(case) or of_k
     if (
         of_lengths is not None
         and of_k is not None
@@ -124,12 +131,62 @@ def _of_k(record: CalibrationRecord) -> Finding | None:
         )
     if record.hold is not None and abs(k - 1) > max(_SUSPICIOUS, 3 * record.u_k):
         return Finding(
-            "scale-far-from-1",
+            _FAR_FROM_1,
             f"The scale factor k = {k:.5f} is far from 1.",
             advice=f"Is the nominal value of {record.hold} right, and is each reference length right?",
             concerns=(record.hold,),
         )
     return None
+
+
+def _of_size(record: CalibrationRecord) -> Finding | None:
+    """All lengths of the arm together too long or too short, as no maker leaves them."""
+    size = size_of(record)
+    if size is None or size.probability >= LEVEL or record.scale_set_by:
+        return None
+    capture = record.recording.capture
+    names = [o.name for o in capture.observations if o.fixes_scale]
+    lengths = [f"{length.start} - {length.end}" for length in capture.lengths]
+    source = f"instrument or artefact ({shorten(names, 3)})" if names else f"lengths ({shorten(lengths, 3)})"
+    return Finding(
+        _FAR_FROM_1,
+        f"All lengths of the calibrated arm are {100 * abs(size.factor):.2g} % (u = {100 * size.u:.1g} %) "
+        f"{'longer' if size.factor > 0 else 'shorter'} than nominal, where a maker keeps {100 * KEPT:g} %: most likely "
+        f"the scale of the {source} is wrong.",
+        "Every length that the arm measures is wrong by as much, and U does not contain it.",
+        "Check its unit, certificate and temperature, and the nominal lengths of the arm.",
+        severity="doubt",
+        doubt=f"the scale seems wrong by {100 * abs(size.factor):.2g} %",
+        probability=size.probability,
+        concerns=tuple(names or lengths),
+    )
+
+
+def _of_weak_scale(case: Case) -> Finding | None:
+    """A scale by certified values that are so uncertain that the poses shrink the arm.
+
+    Where the arm is smaller by s, so are the residuals of n degrees of freedom, and the cost, n / 2, falls by n s; with
+    s^2 / (2 u^2) for the scale, the minimum is at s = n u^2.
+    """
+    record, freedom = case.record, float(case.left.degrees_of_freedom) if case.testable else 0.0
+    observations = record.recording.capture.observations
+    measured = any(o.fixes_scale and not o.certified for o in observations)
+    if measured or record.divided or record.method == REPEATABILITY or record.prior is not None:
+        return None
+    u = u_of_size(record)
+    if freedom * u < _PULLED:
+        return None
+    names = [o.name for o in observations if o.certified]
+    return Finding(
+        "weak-scale",
+        f"The certified values determine the scale to {100 * u:.1g} % only. As the residuals of many poses are smaller "
+        f"where the arm is, its lengths are too short by about {100 * freedom * u**2:.1g} %.",
+        "U does not contain this.",
+        "State smaller u if the certificate allows, or measure a longer reference length.",
+        severity="doubt",
+        doubt="the certified values determine the scale poorly",
+        concerns=tuple(names),
+    )
 
 
 def _of_lengths(case: Case) -> Finding | None:
@@ -202,7 +259,8 @@ def lengths_of(case: Case) -> Lengths | None:
     by_shared = covariance_of_lengths(record.shared, to_numpy(record.calibrated.arm), record.names, capture)
     number = len(by_shared)  # they come before certified values
     by_shared = by_shared / (related.units[:number, None] * related.units[:number])
-    return _tested(record, related, covariance + np.pad(by_shared, (0, len(names) - number)), freedom, names)
+    lengths = _tested(record, related, covariance + np.pad(by_shared, (0, len(names) - number)), freedom, names)
+    return lengths and lengths._replace(by_u=plain.by_u, smaller=plain.smaller)
 
 
 def _tested(
@@ -221,8 +279,10 @@ def _tested(
     worst = int(np.argmax(tested.gains))
     rest = max(square - tested.gains[worst], 0.0)
     chance = probability(square, number)
-    lengths = Lengths(float(np.sqrt(square / number)), number, chance, len(names), names=tuple(names))
-    if number > 1 and probability(rest, number - 1) > _AGREE and _CLEAR * rest < square:
+    ratio = float(np.sqrt(square / number))
+    lengths = Lengths(ratio, number, chance, len(names), names=tuple(names), by_u=ratio, smaller=1 - chance)
+    agree = number > 1 and probability(rest, number - 1) > _AGREE and _CLEAR * rest < square
+    if agree or (number > 1 and tested.gains[worst] > _FAR * max(rest / (number - 1), 1.0)):
         return lengths._replace(odd=names[worst], difference=float(tested.shifts[worst] * related.units[worst]))
     return lengths
 

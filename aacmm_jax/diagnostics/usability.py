@@ -21,36 +21,23 @@ from .noisy_encoders import noisiest_joint
 from .pose_residuals import distances_of
 from .reading_check import coupling_words, explanation_words
 from .recorded import likely_cause
-from .residual_tests import LEVEL
+from .residual_tests import SURE
 
 ORDER, NEEDS = 10, "nothing"
 _APART = 5.0  # RMS of a session among others, over that which it has alone, beyond which they are not of one arm
-_TRY_ALL = "aacmm arm ARM --check MANIFEST tries every order and sign of the columns, and zero offsets of the joints."
+TRY_ALL = "aacmm arm ARM --check MANIFEST tries every order and sign of the columns, and zero offsets of the joints."
 _CHECKED = 150  # poses, drawn at random: more only take longer
 _BETTER = 2.0  # the factor by which other readings must reduce the residual to be believed
 _MOST, _FEW = 0.5, 0.05  # part of the squared residuals that a few poses have, where they are the reason
 
 
 def test(case: Case) -> list[Finding]:
-    """A solve that did not end, residuals that no arm has, and parameters most of which ended on a bound."""
+    """A solve that did not end, and residuals that no arm has."""
     record, findings = case.record, []
     if not record.converged and not record.reason.startswith(SCALE_REFUSED):  # that is said by another finding
         findings.append(Finding("not-converged", record.reason, severity="unusable"))
     if record.residual > record.largest_usual_residual:
         findings.append(_of_residuals(case))
-    elif record.plausible_scale and many_on_bounds(record):
-        sides, mistake = on_bounds(record), case.once(mistake_in_data)
-        findings.append(
-            Finding(
-                "many-on-bounds",
-                f"{len(sides)} of {len(record.names)} parameters are on a bound, so either the bounds are too narrow, "
-                "or the data do not match the arm.",
-                advice=mistake or f"Widen the bounds (--length-bound-mm, --angle-bound-deg). {_TRY_ALL}",
-                severity="doubt",
-                doubt=f"on a bound: {shorten(sorted(sides), 3)}",
-                concerns=tuple(sides),
-            )
-        )
     return findings
 
 
@@ -93,11 +80,11 @@ def mistake_in_data(case: Case) -> str:
     except InputError:  # neither two poses in a socket nor measured points
         return ""
     if check.couplings:
-        return f"Likely cause: {coupling_words(check.couplings)}. {_TRY_ALL}"
+        return f"Likely cause: {coupling_words(check.couplings)}. {TRY_ALL}"
     given, best = check.given.rms_fitted, check.best.rms_fitted
     if not check.explained or check.best == check.given or best * _BETTER > given:
         return ""
-    return f"Likely cause: {explanation_words(check.best)}. {_TRY_ALL}"
+    return f"Likely cause: {explanation_words(check.best)}. {TRY_ALL}"
 
 
 def likely_reason(case: Case) -> str:
@@ -121,7 +108,7 @@ def likely_reason(case: Case) -> str:
         # What equations linear in the residuals tell, which must be small for that.
         noisiest = case.once(noisiest_joint)
         joints = [encoder.joint for encoder in record.noisy_encoders]
-        joints += [noisiest.joint] if noisiest is not None and noisiest.probability < LEVEL else []
+        joints += [noisiest.joint] if noisiest is not None and noisiest.probability < SURE else []
         if joints:
             return f"play or a loose encoder in joint {joints[0]}"
         bending = [str(term.joint) for term in case.once(missing) if term.kind == "gravity"]

@@ -14,7 +14,7 @@ from ..data.capture_data import UNKNOWN, Repeated
 from ..data.noise import ArmNoise
 from ..data.observations.declared import Entry
 from ..data.observations.observation import AbstractObservation, kinds
-from ..data.recording import ProbedSphere, Recording, checked_sphere
+from ..data.recording import ProbedSphere, ReadImage, Recording, checked_sphere
 from ..kinematics.arm import Arm, correction_names, readings_unit
 from ..kinematics.chain import beside_joints
 from ..kinematics.corrected_arm import loads_of
@@ -22,8 +22,8 @@ from ..kinematics.parameters import ArmSpecification, UrdfSource, single
 from ..kinematics.priors import Prior
 from .arm_tables import GEOMETRY, with_coefficients
 from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, undamaged, write_tables
-from .records import Field, attribute_name, record_in, row_values, rows_table, table_of, values_in
-from .schema import ARM, LENGTHS, RECORDING, SPHERES, USUAL_NOISE
+from .records import Field, attribute_name, record_in, row_values, rows_in, rows_table, table_of, values_in
+from .schema import ARM, IMAGES, LENGTHS, RECORDING, SPHERES, USUAL_NOISE
 from .stored_checks import read_checked
 
 _OBSERVATION = "observation_"
@@ -101,6 +101,8 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
         tables["as_found_arm"] = arm_table(recording.as_found)
     if recording.spheres:
         tables["sphere"] = sphere_table(recording.spheres, arm)
+    if recording.images:
+        tables["images"] = rows_table("image", recording.images, IMAGES)
     if recording.usual is not None:
         tables["usual_noise"] = table_of(recording.usual, USUAL_NOISE)
     for number, observation in enumerate(capture.observations, start=1):
@@ -153,12 +155,13 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
         spheres=spheres,
         usual=record_in(ArmNoise, USUAL_NOISE, stored.tables.get("usual_noise")),
         as_found=as_found,
+        images=rows_in(ReadImage, IMAGES, "image", stored.tables.get("images")),
         **values_in(Recording, RECORDING, stored.tables, stored.attributes),
     )
 
 
 def _field(entry: Entry) -> Field:
-    content = "number" if entry.content == "points" else entry.content
+    content = {"points": "number", "ids": "count"}.get(entry.content, entry.content)
     return Field(entry.says, entry.unit, entry.dimensions, content)
 
 

@@ -19,6 +19,7 @@ from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.covariance import SharedErrors
 from ..uncertainty.coverage import COVERAGE_FACTOR
 from ..uncertainty.degrees_of_freedom import Components
+from ..uncertainty.kept_geometry import KeptGeometry
 from . import captures, schema
 from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, opened, undamaged, write_tables
 from .records import Fields, Within, number, records_within, rows_table, table_of, tables_within, text, truth, values_in
@@ -26,6 +27,7 @@ from .stored_checks import read_checked
 
 _RECORDS = {
     "shared": Within("shared_errors", SharedErrors, schema.SHARED_ERRORS),
+    "kept": Within("kept_geometry", KeptGeometry, schema.KEPT_GEOMETRY),
     "components": Within("components", Components, schema.COMPONENTS),
 }
 

@@ -15,13 +15,14 @@ from ..core.errors import InputError, naming, nearest
 from ..core.text import shorten
 from ..data.capture import Capture, ReferenceLength, check_readings, join_sessions
 from ..data.observations.held import Socket
-from ..data.recording import ProbedSphere, Recording, checked_sphere
+from ..data.recording import ProbedSphere, ReadImage, Recording, checked_sphere
 from ..kinematics.arm import Arm
 from ..kinematics.chain import beside_joints
 from ..kinematics.parameters import ArmSpecification
 from ..kinematics.workspace import Reach
 from .arms import arm_beside, for_capture, read_arm, usual_noise
 from .inputs import InputFile
+from .manifest_pixels import Cameras, Progress, observations_of, without_progress
 from .manifest_readings import Readings, points_of
 from .manifest_rows import Source, name_of, parts
 from .manifest_tables import TABLES, Length, PointsManifest, PosesManifest, Recorded
@@ -30,7 +31,7 @@ from .patterns import check_fields, check_name, fields_of, fill, in_braces, matc
 from .toml import read_toml
 
 
-def read_manifest(path: str | os.PathLike) -> Recording:
+def read_manifest(path: str | os.PathLike, *, progress: Progress = without_progress) -> Recording:
     """Read a manifest and every file it names, in mm and rad; paths are relative to the manifest.
 
     A field in braces matches part of a path and makes one socket for each value found: with
@@ -45,6 +46,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
 
     Args:
         path: the manifest (TOML).
+        progress: called with the names of images before they are read, and a word for what is done; yields them.
 
     Example:
         >>> from pathlib import Path
@@ -57,7 +59,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
         >>> print(aj.files.read_manifest("capture.toml").capture.sizes)
         (40,)
     """
-    return _read(path)[0]
+    return _read(path, progress)[0]
 
 
 def readings_of_manifest(path: str | os.PathLike) -> Readings:
@@ -65,7 +67,7 @@ def readings_of_manifest(path: str | os.PathLike) -> Readings:
     return _read(path)[1]
 
 
-def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
+def _read(path: str | os.PathLike, show: Progress = without_progress) -> tuple[Recording, Readings]:
     model = read_toml(manifest := InputFile(path), PosesManifest)
     path = as_path(path)
     with naming(path):
@@ -78,6 +80,11 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
         # Where another tip than the arm's own probe was held, it is an observation.
         others = [seat for seat in sockets.values() if seat.target]
         observed += [(seat.session, Socket(seat.name, seat.poses, target=seat.target)) for seat in others]
+        cameras, images = Cameras(source, model.camera, model.target), list[ReadImage]()
+        for entry in model.pixels:
+            for values in _fields(path.parent, entry, "pixels"):
+                seen, read = observations_of(cameras, source, entry, values, show)
+                observed, images = [*observed, *seen], [*images, *read]
         for kind in TABLES:
             for entry in () if kind is Socket else getattr(model, kind.table):
                 for values in _fields(path.parent, entry, kind.table):
@@ -108,8 +115,24 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
             measuring_range=model.measuring_range,
             usual=usual_noise(arm, base=model.base, tip=model.tip),
             as_found=as_found,
+            stated=_stated(model),
+            images=tuple(images),
         )
         return recording, readings
+
+
+def _stated(model: PosesManifest) -> tuple[str, ...]:
+    """What the manifest states of readings and points, as `Recording.stated` names it."""
+    given = set() if model.angles is None else model.angles.model_fields_set
+    stated = given & {"columns", "sign", "offset", "unit"}
+    for table in (entry for kind in TABLES for entry in getattr(model, kind.table)):
+        picked = "q" in table.columns if isinstance(table.columns, dict) else bool(table.columns)
+        stated |= {
+            name
+            for name, by_hand in (("columns", picked), ("unit", "q" in table.units), ("units", "points" in table.units))
+            if by_hand
+        }
+    return tuple(sorted(stated))
 
 
 def _as_found(file: str | Path, nominal: Arm) -> ArmSpecification:

@@ -12,7 +12,8 @@ from ..core.text import quoted
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import check_revolutions
 from ..kinematics.arm import Arm
-from .manifest_tables import Angles, PointsTable, as_list
+from .manifest_files import as_list
+from .manifest_tables import Angles, PointsTable
 from .table_columns import LINE, TEMPERATURE, TORQUE, header_units, position_columns, proposed_columns, reading_columns
 from .text_lines import Column
 from .text_table import TextTable

@@ -1,6 +1,6 @@
 """What the text tables of a manifest hold besides readings and points: the entries of observations, row by row.
 
-Nothing here depends on a kind: `AbstractObservation.entries` says what each needs.
+Nothing here depends on a kind: `Declared.entries` says what each needs.
 """
 
 import math
@@ -13,11 +13,11 @@ import numpy as np
 from ..core.errors import InputError, nearest
 from ..core.text import quoted, shorten
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
-from ..data.observations.declared import Entry
-from ..data.observations.observation import AbstractObservation
+from ..data.observations.declared import Declared, Entry
 from .inputs import InputFile, fingerprint
+from .manifest_files import PRESETS, Preset, as_list
 from .manifest_readings import Wanted, checked_unit
-from .manifest_tables import NUMBERS_OF_ROTATION, PRESETS, Preset, as_list
+from .manifest_tables import NUMBERS_OF_ROTATION
 from .patterns import check_name, fields_of, fill
 from .text_lines import TABLE_SHARE, Column
 from .text_table import TextTable
@@ -61,9 +61,7 @@ def name_of(table: Any, values: Mapping[str, str]) -> str:
     return name
 
 
-def parts(
-    source: Source, kind: type[AbstractObservation], table: Any, values: Mapping[str, str], where: str
-) -> Iterator[Part]:
+def parts(source: Source, kind: type[Declared], table: Any, values: Mapping[str, str], where: str) -> Iterator[Part]:
     """The parts of one table of a manifest, one for each session and group; ``where`` names it in messages, and
     ``values`` are those of its fields in braces."""
     reader = _Reader(source, kind, table, where)
@@ -114,9 +112,10 @@ def _filled(text: str, values: Mapping[str, str], what: str) -> str:
 class _Reader:
     """The entries of one table, from its files and from the manifest."""
 
-    def __init__(self, source: Source, kind: type[AbstractObservation], table: Any, where: str):
+    def __init__(self, source: Source, kind: type[Declared], table: Any, where: str):
         self._source, self._table, self._where = source, table, where
-        self._preset = PRESETS[table.preset] if table.preset is not None else Preset({})
+        preset = PRESETS[table.preset] if table.preset is not None else Preset({})
+        self._preset = preset._replace(columns=getattr(kind, "usual", {}) | preset.columns)
         # In a manifest of points, a point stands where a pose has its readings.
         self.entries = {source.quantity if entry.name == "q" else entry.name: entry for entry in kind.entries}
         columns = table.columns if isinstance(table.columns, dict) else {source.quantity: table.columns}

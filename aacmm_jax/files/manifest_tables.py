@@ -3,8 +3,7 @@
 import datetime
 import math
 import re
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -14,9 +13,7 @@ from pydantic import (
     Field,
     FiniteFloat,
     NonNegativeFloat,
-    NonNegativeInt,
     PositiveFloat,
-    PositiveInt,
     create_model,
     model_validator,
 )
@@ -27,11 +24,12 @@ from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import ReferenceLength
 from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation, kinds
+from ..data.observations.pixels import Pixels
 from ..data.recording import SphereTest
 from ..kinematics.arm import Arm, by_joint
 from ..kinematics.correction_kinds import REFERENCE_TEMPERATURE
-from .table_columns import OF_UR
-from .text_lines import Column
+from .manifest_cameras import CameraTable, PixelsTable, TargetTable
+from .manifest_files import NamedTable, Picked, Table
 from .toml import Point, Strict, each_once
 
 NUMBERS_OF_ROTATION = {"vector": 3, "quaternion wxyz": 4, "quaternion xyzw": 4, "matrix": 9}
@@ -41,57 +39,6 @@ _Day = Annotated[datetime.date, Field(strict=False), _OF_TIME]
 _ByJoint = PositiveFloat | Annotated[list[PositiveFloat], Field(min_length=1)]
 
 
-class Preset(NamedTuple):
-    """Columns, units and conventions of tables that people have; a manifest may change each of them."""
-
-    columns: Mapping[str, Sequence[Sequence[Column]]]  # the first choice that a table has
-    units: Mapping[str, str] = {}  # where neither the manifest nor the table's header states one
-    rotation: str | None = None
-    coverage_factor: float = 1.0
-    decimal: str | None = "."  # None: a comma where the table has one, but no point, between semicolons
-
-
-PRESETS = {
-    # Positions as `aacmm plan` writes them, or with plainer names; readings are found by their names.
-    "csv": Preset(
-        {
-            "points": [["x_mm", "y_mm", "z_mm"], ["x", "y", "z"]],
-            "u": [["u_x_mm", "u_y_mm", "u_z_mm"], ["u_x", "u_y", "u_z"]],
-        },
-        {"q": "deg"},
-    ),
-    # 6-D export of a laser tracker: U(95) of the coordinates, scalar part of the quaternion first. Names as in the
-    # exports of ZhangTeng-Hust/ASTL (T-Mac of 2022): "X  [mm]", "U(95) X  [mm]", "Q0 "; others write "U95 X".
-    "leica": Preset(
-        {
-            "points": [["X", "Y", "Z"]],
-            "u": [["U*95* X", "U*95* Y", "U*95* Z"]],
-            "rotations": [["Q0", "Q1", "Q2", "Q3"]],
-        },
-        rotation="quaternion wxyz",
-        coverage_factor=2.0,
-    ),
-    # Point lists with the direction in which a point was probed, which is not needed.
-    "xyzijk": Preset({"points": [["X", "Y", "Z"], [1, 2, 3]]}),
-    # christianlandgraf/ipa-robot-accuracy, its own files (semicolons, decimal commas) and tables with units in their
-    # names; R = Rx(rx) Ry(ry) Rz(rz) is the order that agrees with the robot's joints.
-    "ipa": Preset(
-        {
-            "q": [[f"{joint}_joint" for joint in OF_UR]],
-            "points": [["x_mm", "y_mm", "z_mm"], ["measurement_x", "measurement_y", "measurement_z"]],
-            "u": [
-                ["std_x_mm", "std_y_mm", "std_z_mm"],
-                ["measurement_std_x", "measurement_std_y", "measurement_std_z"],
-            ],
-            "rotations": [["rx_deg", "ry_deg", "rz_deg"], ["measurement_rx", "measurement_ry", "measurement_rz"]],
-        },
-        {"q": "rad", "rotations": "deg"},
-        rotation="XYZ",
-        decimal=None,
-    ),
-}
-
-
 def _rotation(text: str) -> str:
     if text not in NUMBERS_OF_ROTATION and not _EULER.fullmatch(text):
         raise ValueError(
@@ -99,14 +46,6 @@ def _rotation(text: str) -> str:
             "as XYZ (moving axes, R = Rx Ry Rz) or xyz (fixed axes, R = Rz Ry Rx)."
         )
     return text
-
-
-Picked = PositiveInt | str | Annotated[list[PositiveInt | str], Field(min_length=1)]
-
-
-def as_list(picked: Column | list[Column]) -> list[Column]:
-    """Columns as they are picked: one of them is a list, too."""
-    return picked if isinstance(picked, list) else [picked]
 
 
 class Angles(Strict):
@@ -149,41 +88,7 @@ class Angles(Strict):
         return numbers("sign") * (readings - numbers("offset")) * units
 
 
-class Table(Strict):
-    """What all tables of files have in common."""
-
-    file: str | None = None
-    files: Annotated[list[str], Field(min_length=1), AfterValidator(each_once)] | dict[str, str] | None = None
-    preset: Literal["csv", "leica", "xyzijk", "ipa"] | None = None
-    columns: Picked | dict[str, Picked] = Field(default_factory=dict)
-    units: dict[str, str] = Field(default_factory=dict)
-    delimiter: Literal[",", ";", "\t", " "] | None = None
-    decimal: Literal[".", ","] | None = None  # None: that of the preset, else a point
-    skip: NonNegativeInt = 0
-    group: PositiveInt | str | None = None
-    temperature_C: FiniteFloat | None = None  # of the arm, where the table has no such column
-
-    @model_validator(mode="after")
-    def _one_source(self) -> Any:
-        if (self.file is None) == (self.files is None):
-            raise ValueError("needs either file or files.")
-        return self
-
-    @property
-    def paths(self) -> list[str]:
-        """Its files, for fields in braces."""
-        if self.file is not None:
-            return [self.file]
-        return list(self.files.values() if isinstance(self.files, dict) else self.files or ())
-
-
-class _Named(Table):
-    name: str | None = None
-    exclude: list[str] = Field(default_factory=list)
-    session: str | None = None  # of all rows; columns.session, of each
-
-
-class SocketTable(_Named):
+class SocketTable(NamedTable):
     """Poses with the tip in one socket, or in several of which a column (``group``) has the names."""
 
     target: str | None = None
@@ -201,7 +106,7 @@ class SocketTable(_Named):
         return self
 
 
-class _Table(_Named):
+class _Table(NamedTable):
     """What the tables of all other kinds have in common."""
 
     readings: str | None = None  # file of the readings, in the same order
@@ -209,7 +114,7 @@ class _Table(_Named):
     coverage_factor: PositiveFloat | None = None  # of the columns of u
 
 
-def _model(kind: type[AbstractObservation]) -> type[_Named]:
+def _model(kind: type[AbstractObservation]) -> type[NamedTable]:
     """The table of a kind: what is stated in the manifest itself, and not in columns only."""
     if kind is Socket:
         return SocketTable
@@ -227,7 +132,8 @@ def _model(kind: type[AbstractObservation]) -> type[_Named]:
     return create_model(f"{kind.__name__}Table", __base__=_Table, **fields)
 
 
-TABLES = {kind: _model(kind) for kind in kinds().values()}
+# Corners of images are read in another way than numbers of poses: `manifest_pixels`.
+TABLES = {kind: _model(kind) for kind in kinds().values() if kind is not Pixels}
 
 
 class Length(Strict):
@@ -309,6 +215,9 @@ class _Poses(Recorded):
     measuring_range: PositiveFloat | None = None  # diameter of the measuring volume as the maker states it, mm
     angles: Angles | None = None
     sessions: Sessions | None = None
+    camera: list[CameraTable] = Field(default_factory=list)
+    target: list[TargetTable] = Field(default_factory=list)
+    pixels: list[PixelsTable] = Field(default_factory=list)
 
 
 _FIELDS: dict[str, Any] = {

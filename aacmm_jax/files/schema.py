@@ -15,6 +15,9 @@ RECORDING: Fields = {
     "measured": text("day of the measurement"),
     "acceptance": text("standards whose acceptance procedure was followed", among=("", *STANDARDS)),
     "measuring_range": number("diameter of the measuring volume, as the maker states it", "mm"),
+    "stated": text(
+        "what the manifest states of the readings and points", among=("", "columns", "sign", "offset", "unit", "units")
+    ),
 }
 
 NOISE: Fields = {
@@ -45,6 +48,13 @@ SPHERES: Fields = {
     "stylus": number("diameter of the probe's ball", "mm", least=0),
     "form": number("calibrated form error", "mm", least=0),
     "u_form": number("standard uncertainty of the form error", "mm", least=0),
+}
+
+IMAGES: Fields = {
+    "observation": text("observation to which the image belongs"),
+    "image": text("name of the image, or number of its pose"),
+    "corners": count("number of corners"),
+    "refused": text("why the image is not used; empty if it is used"),
 }
 
 _COEFFICIENTS = ("coefficient", "coefficient_2")
@@ -262,6 +272,13 @@ UNCERTAINTY: Fields = {
     "scatter_degrees_of_freedom": number("degrees of freedom of the noise", "1", least=0),
 }
 
+KEPT_GEOMETRY: Fields = {
+    "names": text("part of the geometry", "kept", name="kept"),
+    "values": number("value, as the calibration found it", "mm or rad", "kept"),
+    "follow": number("derivatives with respect to the parameters", "quotients of units", "kept", "kept_parameter"),
+    "covariance": number("covariance for given parameters", "products of units", "kept", "kept_2"),
+}
+
 JUDGED: Fields = {
     "limits": mapping("MPE of each metric: constant term (mm) and divisor of the length"),
     "u_test": number("standard uncertainty due to seat and fixture", "mm", least=0),
@@ -290,6 +307,7 @@ TABLES: dict[str, Fields] = {
     "usual_noise": USUAL_NOISE,
     "reference": LENGTHS,
     "sphere": SPHERES,
+    "images": IMAGES,
     "parameters": CALIBRATION,
     "monte_carlo": SAMPLED,
     "noisy_encoders": NOISY_ENCODERS,

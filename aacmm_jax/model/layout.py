@@ -104,12 +104,18 @@ def unknowns_of(observation: AbstractObservation) -> dict[str, Units]:
     return dict(observation.unknowns) | target
 
 
-def layout_of(observations: Sequence[AbstractObservation], ends: Sequence[tuple[str, str]]) -> Layout:
-    """The layout of a problem; ``ends`` are the names of the positions at the ends of its reference lengths."""
+def layout_of(
+    observations: Sequence[AbstractObservation], ends: Sequence[tuple[str, str]], shared: Sequence[str] = ()
+) -> Layout:
+    """The layout of a problem; ``ends`` are the names of the positions at the ends of its reference lengths. Parts that
+    are named ``shared`` are so even where one observation alone uses them."""
     used = [unknowns_of(observation) for observation in observations]
     units = {name: units for parts in used for name, units in parts.items()}
     users = Counter(name for parts in used for name in parts)
-    alone = {name: number for number, parts in enumerate(used) for name in parts if users[name] == 1}
+    together = set(shared)
+    alone = {
+        name: number for number, parts in enumerate(used) for name in parts if users[name] == 1 and name not in together
+    }
     # A length with one shared end says something of what is shared alone.
     half = {name for pair in ends if (pair[0] in alone) != (pair[1] in alone) for name in pair}
     alone = {name: number for name, number in alone.items() if name not in half}
@@ -132,7 +138,7 @@ def layout_of(observations: Sequence[AbstractObservation], ends: Sequence[tuple[
     classes = _by(lambda member: member.kind, [member for member in problem if member.private])
     classes = sorted(classes, key=lambda members: members[0].is_linear)  # those with linear rows come last
     names, shapes, places, class_index_of = [name for name in units if name not in private], [], {}, {}
-    shared = sum(len(units[name]) for name in names)
+    of_shared = sum(len(units[name]) for name in names)
     for number, some in enumerate(classes):
         components: dict[int, list[str]] = {}
         for member in some:
@@ -142,7 +148,7 @@ def layout_of(observations: Sequence[AbstractObservation], ends: Sequence[tuple[
         names += itertools.chain(*components.values())
         shapes.append((len(components), some[0].size))
     linear = sum(some[0].is_linear for some in classes)
-    layout = Layout(tuple((name, units[name]) for name in names), shared, tuple(shapes), linear, ())
+    layout = Layout(tuple((name, units[name]) for name in names), of_shared, tuple(shapes), linear, ())
     stops = np.cumsum([observation.q.shape[-2] for observation in observations]).tolist()
     groups = []
     for some in _by(lambda member: member.key, problem):

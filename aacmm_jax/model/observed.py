@@ -25,7 +25,7 @@ from ..solver.arrow import split
 from .layout import Layout, layout_of, unknowns_of
 from .sockets import means_over_sockets
 
-_STEPS = {"mm": 1.0, "rad": 1e-3}  # natural steps, as those of the arm's parameters
+_STEPS = {"mm": 1.0, "rad": 1e-3, "px": 1.0, "1": 1e-3}  # natural steps, as those of the arm's parameters
 
 
 @pytree
@@ -42,9 +42,10 @@ class Observed:
     layout: Layout = static()
 
     @classmethod
-    def of(cls, capture: Capture, arm: Arm | None, *, lengths: bool = True) -> "Observed":
+    def of(cls, capture: Capture, arm: Arm | None, *, lengths: bool = True, shared: Sequence[str] = ()) -> "Observed":
         """What a capture observed, by an arm with such joints; None where only what is unknown matters. Without its
-        reference ``lengths`` sockets are independent of each other. Raises `InputError` for a batch of captures."""
+        reference ``lengths`` sockets are independent of each other; ``shared`` as for `layout_of`. Raises `InputError`
+        for a batch of captures."""
         check_one_capture(capture)
         capture = to_numpy(capture)
         if arm is not None:
@@ -52,7 +53,7 @@ class Observed:
         xp, observations = namespace(capture), to_numpy(capture.parts)
         q = xp.concatenate([observation.q for observation in observations])
         references, ends = (capture.lengths, ends_of(capture)) if lengths else ((), ())
-        layout = layout_of(observations, ends)
+        layout = layout_of(observations, ends, shared)
         return cls(
             observations=observations,
             stacks=_stacks(observations, layout),

@@ -19,14 +19,21 @@ from ..core.units import DEG
 from ..data.capture import Capture
 from ..data.recording import Recording
 from ..diagnostics.capture_check import search_couplings
+from ..diagnostics.causes import term_text
 from ..diagnostics.contradictions import remove_contradicting
+from ..diagnostics.culprits import culprits_of
 from ..diagnostics.equations import EXACT
+from ..diagnostics.findings import case_of
 from ..diagnostics.reading_check import coupling_words
+from ..diagnostics.residual_tests import LEVEL
+from ..diagnostics.scale import lengths_of
 from ..diagnostics.usability import on_bounds
-from ..kinematics.arm import correction_names, is_length, without_corrections
+from ..kinematics.arm import correction_names, is_length, value_of, without_corrections
 from ..kinematics.corrected_arm import with_further_corrections
+from ..kinematics.corrections import all_sought
 from ..kinematics.parameters import ArmSpecification
 from ..kinematics.priors import default_prior
+from ..kinematics.workspace import total_link_length
 from .model_ladder import ComparedModels, compare_models, default_models
 
 Solve = Callable[[Recording], Calibration | Identification]
@@ -34,7 +41,9 @@ Record = Callable[[Calibration | Identification, Recording], CalibrationRecord]
 
 _WIDER, _ROUNDS = 5.0, 4  # factor by which bounds that were reached are widened, and how often
 _WIDEST = np.pi / 2  # rad
+_SIZE = 2.0  # factor within which the size of an arm stays that of the nominal one
 _BY_CHANCE = 0.01  # probability of so much smaller residuals by chance, below which wider bounds are kept
+_MOST = 0.5  # part of the excess of the residuals that a cause explains, from which it explains most of them
 _PLAIN = "dh"
 _SOME, _FUNCTIONS = "harmonics=1-6", "functions"
 _WORTH = 10.0  # log evidence that a richer model must add for a still richer one to be tried
@@ -44,8 +53,8 @@ def with_full_couplings(record: CalibrationRecord, solve: Solve, recorded: Recor
     """The calibration with joints that move by the readings of others as well, where the readings do not fit the arm
     without (`search_couplings`); else as it is.
 
-    Where a model is stated (not ``further``), only its own couplings are set. A coupling is a coefficient like any
-    other, but its nominal value, which is the mean of its prior, is 1 or -1 instead of 0.
+    Where a model is stated (not ``further``), only its own couplings are set, and none with a stated value. A coupling
+    is a coefficient like any other, but its nominal value, which is the mean of its prior, is 1 or -1 instead of 0.
     """
     nominal, capture = record.recording.nominal, record.recording.capture
     try:
@@ -53,7 +62,8 @@ def with_full_couplings(record: CalibrationRecord, solve: Solve, recorded: Recor
     except InputError:  # neither sockets nor points
         return record
     missing = [name for name in couplings if name not in correction_names(nominal.arm)]
-    if not couplings or (missing and not further):
+    stated = any(value_of(nominal.arm, name) for name in couplings if name not in missing)
+    if not couplings or stated or (missing and not further):
         return record
     arm = with_further_corrections(nominal.arm, missing).replace(**couplings)
     recording = record.recording._replace(nominal=nominal._replace(arm=arm))
@@ -84,7 +94,10 @@ def with_wider_bounds(record: CalibrationRecord, solve: Solve, recorded: Record)
         except InputError:  # with such bounds the data do not determine the arm
             break
         wider = recorded(result, recording)
-        if wider.converged and _is_better(wider, best, len(reached)):
+        size, usual = (total_link_length(arm) for arm in (wider.calibrated.arm, nominal.arm))
+        # Points in a wrong unit fit an arm that shrinks, or grows, with its bounds.
+        of_this_size = usual / _SIZE < size < usual * _SIZE
+        if wider.converged and of_this_size and _is_better(wider, best, len(reached)):
             best = wider
     if best is record:
         return record
@@ -131,12 +144,19 @@ def without_contradicting(record: CalibrationRecord, solve: Solve, recorded: Rec
     return kept._replace(decisions=record.decisions)
 
 
-def with_best_model(record: CalibrationRecord, recorded: Record, options: Any) -> CalibrationRecord:
+def with_best_model(record: CalibrationRecord, solve: Solve, recorded: Record, options: Any) -> CalibrationRecord:
     """The calibration with the model of the joints that predicts held-out regions best; as it is where that is the arm
-    alone, or where there are too few poses to hold some out."""
+    alone, where there are too few poses to hold some out, or where a wrong certified value explains most of the
+    residuals: a model would only describe what that does to the arm."""
     recording = record.recording
     nominal, capture = recording.nominal, recording.capture
     if record.observed.rms < EXACT:  # simulated without noise
+        return record
+    case = case_of(record)
+    causes, lengths = culprits_of(case), case.once(lengths_of)
+    if causes and causes[0].kind == "certified" and causes[0].explains > _MOST:
+        return record
+    if not causes and lengths is not None and lengths.odd and lengths.probability < LEVEL:
         return record
     bounds = nominal.bounds()
 
@@ -159,14 +179,17 @@ def with_best_model(record: CalibrationRecord, recorded: Record, options: Any) -
     chosen, plain = ladder.recommended, ladder.models[0]
     if chosen.model == _PLAIN or not chosen.result.converged:
         return record
+    found = [cause.term for cause in causes if cause.kind == "term" and cause.term is not None]
+    terms = [term_text(term) for term in found if term.kind in all_sought() or term.term.correction is not None]
+    follow = f" Without it, residuals follow {shorten(terms, 3)}." if terms else ""
     says = (
-        f"Model of the joints: {chosen.model}. It predicts held-out regions to {chosen.rms_outside:.3g} mm RMS, where "
-        f"Denavit-Hartenberg parameters alone predict them to {plain.rms_outside:.3g} mm ({len(ladder.models)} models "
-        f"compared, {len(chosen.regions)} regions)."
+        f"Model of the joints: {chosen.model}.{follow} It predicts held-out regions to {chosen.rms_outside:.3g} mm "
+        f"RMS, where Denavit-Hartenberg parameters alone predict them to {plain.rms_outside:.3g} mm "
+        f"({len(ladder.models)} models compared, {len(chosen.regions)} regions)."
     )
     corrected = chosen.result.space.base
     modelled = recording._replace(nominal=nominal._replace(arm=corrected, prior=default_prior(corrected)))
-    again = recorded(chosen.result, modelled)
+    again = recorded(chosen.result if options.shared_errors else solve(modelled), modelled)
     return again._replace(removed=record.removed, decisions=(*record.decisions, says))
 
 

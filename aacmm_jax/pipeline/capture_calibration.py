@@ -130,7 +130,9 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
     if automatic:
         recording, chosen, decided = with_prior_of_few(recording, chosen)
     anchor = None if chosen.hold == _SOLVE.hold else (chosen.hold,)  # two stages, which no other model would have
-    stated = (chosen.model, chosen.robust, chosen.method, anchor, recording.nominal.prior, nominal.arm.corrections)
+    prior = chosen.prior is None or recording.nominal.prior is not None
+    given = (chosen.model, chosen.robust, chosen.method, anchor, nominal.arm.corrections)
+    stated = prior or any(value is not None for value in given)
 
     def recorded(result: Calibration | Identification, part: Recording) -> CalibrationRecord:
         record = record_of(result, part, robust=chosen.robust)
@@ -152,8 +154,8 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
             record = chosen.stage("Checking bounds", lambda: with_wider_bounds(record, solved, recorded))
         if chosen.remove_contradicting or (automatic and chosen.robust is None):  # which bad poses do not move
             record = chosen.stage("Comparing groups", lambda: without_contradicting(record, solved, recorded))
-        if automatic and all(value is None for value in stated):
-            record = with_best_model(record, recorded, chosen)
+        if automatic and not stated:
+            record = with_best_model(record, solved, recorded, chosen)
         if masks:
             record = chosen.stage("Testing held-out poses", lambda: tested(record, capture, masks))
         if _to_cross_validate(record, chosen):
@@ -252,4 +254,5 @@ def join_recordings(recordings: Mapping[str, Recording], *, same_probe: bool = F
         {name: recording.capture for name, recording in recordings.items()}, own_probe=not same_probe
     )
     sources = tuple(source for recording in recordings.values() for source in recording.sources)
-    return first._replace(capture=capture, true=None, seed=None, spheres=(), sources=sources)
+    stated = tuple(sorted({name for recording in recordings.values() for name in recording.stated}))
+    return first._replace(capture=capture, true=None, seed=None, spheres=(), sources=sources, stated=stated)

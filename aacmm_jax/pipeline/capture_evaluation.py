@@ -4,8 +4,9 @@ One call each, whose options state their defaults once.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -23,16 +24,24 @@ from ..acceptance.record import (
 )
 from ..acceptance.results import Measured
 from ..acceptance.standards import OF_SPHERES, STANDARDS, checked_standards
+from ..calibration.pose_table import noise_of_poses
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.arguments import NotNegative, checked_arguments, with_options
 from ..core.errors import InputError
-from ..core.text import shorten
+from ..core.numpy_or_jax import to_numpy
+from ..core.text import listed, shorten
 from ..data.capture import Capture
 from ..data.recording import Recording
 from ..diagnostics.findings import findings_of, sentences
 from ..diagnostics.usability import why_unusable
 from ..kinematics.arm import Arm
+from ..model.observed import Observed
+from ..uncertainty.arm_uncertainty import Uncertainty
+from ..uncertainty.kept_geometry import KeptGeometry
+from ..uncertainty.linearisation import Linearisation
 from .data_corrections import with_readings_of_arm
+
+_LEAST = 1e-6  # mm: smallest standard uncertainty of what is certified
 
 
 class EvaluationOptions(NamedTuple):
@@ -55,6 +64,7 @@ class EvaluationOptions(NamedTuple):
     measuring_range: float | None = None
     maxima: Mapping[str, NotNegative] = MappingProxyType({})
     calibration_warnings: Sequence[str] | None = None
+    keep: Sequence[Literal["target", "frame"]] = ()
 
 
 @checked_arguments
@@ -82,6 +92,9 @@ def evaluate_capture(record: CalibrationRecord, recording: Recording, **options:
         maxima: limits of the quantities in `acceptance.record.MAXIMA`, mm.
         calibration_warnings: what should be read about the calibration itself; by default it is tested again
             (`diagnostics.findings_of`).
+        keep: geometry that is not fitted to the capture, but is as the calibration found it: "target", the place of a
+            target in the last frame, which was not mounted anew; "frame", that of an instrument or artefact, neither
+            of which nor the base has moved. The nominal arm has its own, fitted.
 
     Returns:
         The record, from which errors and acceptance tests follow; it has warnings on what makes it doubtful.
@@ -99,9 +112,15 @@ def evaluate_capture(record: CalibrationRecord, recording: Recording, **options:
     """
     chosen = EvaluationOptions(**options)
     used = {row.tobytes() for row in np.asarray(record.recording.capture.readings)}
-    capture, corrected = with_readings_of_arm(record, recording.capture.select(chosen.only, chosen.without))
-    capture = _divided(record.calibrated.arm, capture, used)
-    check_geometry(record.calibrated.arm, capture)
+    capture, corrected = with_readings_of_arm(
+        record, recording.capture.select(chosen.only, chosen.without), recording.stated
+    )
+    uncertainty = uncertainty_of(record)
+    if chosen.keep:
+        uncertainty = replace(uncertainty, kept=_kept(record, uncertainty, capture, chosen.keep))
+    kept = () if uncertainty.kept is None else uncertainty.kept.names
+    capture = _divided(record.calibrated.arm, capture, used, kept)
+    check_geometry(record.calibrated.arm, capture, kept)
     readings = dict(capture.sockets) | {part.name: part.q for part in capture.observations}
     shared = {name: sum(row.tobytes() in used for row in np.asarray(q)) for name, q in readings.items()}
     made_for = (*recording.acceptance, *(OF_SPHERES[sphere.test] for sphere in recording.spheres))
@@ -119,7 +138,7 @@ def evaluate_capture(record: CalibrationRecord, recording: Recording, **options:
         u_test=chosen.u_test,
         maxima=dict(chosen.maxima),
         standards=checked_standards(made_for if chosen.standards is None else chosen.standards),
-        uncertainty=uncertainty_of(record),
+        uncertainty=uncertainty,
         calibration_warnings=tuple(sentences(findings_of(record)) if noted is None else noted),
         calibration_unusable=why_unusable(record),
         influences=chosen.influences,
@@ -160,10 +179,11 @@ def evaluate_points(measured: Measured, **options: Any) -> PointsRecord:
         [('Deltam', None), ('SPAT', 'conforms'), ('SPAT_2s', None)]
     """
     chosen = EvaluationOptions(**options)
-    if chosen.maxima or chosen.only is not None or chosen.without or chosen.calibration_warnings is not None:
+    of_captures = chosen.maxima, chosen.without, chosen.keep, chosen.only, chosen.calibration_warnings
+    if any(of_captures[:3]) or any(value is not None for value in of_captures[3:]):
         raise InputError(
-            "--max-..., --only and --without (maxima, only, without) do not apply to a manifest of points; name a "
-            "calibration and a capture, or leave these options out."
+            "--max-..., --only, --without and --keep (maxima, only, without, keep) do not apply to a manifest of "
+            "points; name a calibration and a capture, or leave these options out."
         )
     return PointsRecord(
         measured._replace(measuring_range=chosen.measuring_range or measured.measuring_range),
@@ -221,7 +241,32 @@ def _warnings(
         )
 
 
-def _divided(arm: Arm, capture: Capture, used: Collection[bytes]) -> Capture:
+def _kept(record: CalibrationRecord, uncertainty: Uncertainty, capture: Capture, keep: Sequence[str]) -> KeptGeometry:
+    """The geometry of the calibration that is kept. Raises `InputError` where calibration and capture have none."""
+    kinds = {"target": ("offset of ", "orientation of "), "frame": ("frame of ",)}
+    in_capture, found = Observed.of(capture, None).names, record.observed.geometry
+    parts: list[str] = []
+    for kind in keep:
+        of_kind, of_calibration = (
+            [name for name in names if name.startswith(kinds[kind])] for names in (in_capture, found)
+        )
+        same = [name for name in of_kind if name in of_calibration]
+        if not same:
+            raise InputError(
+                f"--keep {kind} (keep) needs a {kind} of the same name in both, but the calibration has "
+                f"{listed(of_calibration or ['none'])}, and the capture has {listed(of_kind or ['none'])}; leave the "
+                "option out, or rename the one in the capture."
+            )
+        parts += same
+    complete = to_numpy(to_numpy(uncertainty).complete)
+    observed = to_numpy(Observed.of(record.recording.capture, complete.arm))
+    numbers = [np.asarray(record.observed.geometry[name]) for name in observed.blocks]
+    z = np.concatenate([np.asarray(complete.space.vector()), *numbers])
+    noise = noise_of_poses(complete)
+    return KeptGeometry.of(Linearisation.at(observed, complete.space, z, noise=noise, least=_LEAST), parts)
+
+
+def _divided(arm: Arm, capture: Capture, used: Collection[bytes], kept: Collection[str]) -> Capture:
     """With the poses of an observation that were not used as an observation of their own, where others were."""
     observations = []
     for observation in capture.observations:
@@ -230,7 +275,7 @@ def _divided(arm: Arm, capture: Capture, used: Collection[bytes]) -> Capture:
         if seen.any() and not seen.all() and not any(observation.name in (r.start, r.end) for r in capture.lengths):
             unseen = observation.select(np.flatnonzero(~seen)).changed(name=f"{observation.name}, held out")
             try:
-                check_geometry(arm, Capture({}, [], [unseen]))
+                check_geometry(arm, Capture({}, [], [unseen]), kept)
                 parts = [observation.select(np.flatnonzero(seen)), unseen]
             except InputError:
                 pass  # too few poses: the observation counts as identified from

@@ -43,7 +43,8 @@ def with_prior_of_few(recording: Recording, options: Any) -> tuple[Recording, An
     nominal, capture = recording.nominal, recording.capture
     observed, parameters = Observed.of(*to_numpy((capture, nominal.arm))), len(nominal.space().names)
     unknowns = parameters + len(observed.steps)
-    if observed.equations >= unknowns + _SPARE or options.method is not None or options.robust is not None:
+    stated = options.prior is None or options.method is not None or options.robust is not None
+    if observed.equations >= unknowns + _SPARE or stated:
         return recording, options, ()
     if nominal.prior is not None and options.noise is not None:
         return recording, options, ()
@@ -70,7 +71,7 @@ def with_corrected_readings(
     they are, a single such explanation makes them match, and nothing else is as good; and the explanation.
 
     The zeros become those of the nominal arm, so that the calibrated arm holds them. Where several explanations are
-    as good, a sentence lists them and nothing is changed.
+    as good, or one changes what somebody stated, a sentence says so and nothing is changed.
     """
     if not (record.implausible_residual or many_on_bounds(record) or not record.converged):
         return record, None
@@ -88,6 +89,12 @@ def with_corrected_readings(
         texts = [explanation_words(other) or "nothing" for other in (best, *check.others[:2])]
         says = f"The readings do not match the arm, and several corrections fit as well: {'; or '.join(texts)}."
         return record._replace(decisions=(*record.decisions, f"{says} State the right one in [angles].")), None
+    if stated := _stated(recording, best):
+        says = (
+            f"The readings match the arm if {explanation_words(best)}. They were not corrected, because this differs "
+            f"from what is stated: {listed(stated)}."
+        )
+        return record._replace(decisions=(*record.decisions, says)), None
     capture = corrected_capture(recording.capture, best)
     if capture is None:
         return record, None
@@ -106,11 +113,14 @@ def with_corrected_readings(
     return again._replace(decisions=(*record.decisions, says)), best
 
 
-def with_readings_of_arm(record: CalibrationRecord, capture: Capture) -> tuple[Capture, tuple[str, ...]]:
+def with_readings_of_arm(
+    record: CalibrationRecord, capture: Capture, stated: tuple[str, ...]
+) -> tuple[Capture, tuple[str, ...]]:
     """A capture to evaluate a calibration on, with the order, signs and units of its readings with which they match the
     calibrated arm, where they do not as they are and a single explanation makes them match; and what was found.
 
-    Zeros are not corrected: another zero than at the calibration is an error of the arm.
+    Zeros are not corrected: another zero than at the calibration is an error of the arm. Neither is what somebody
+    ``stated`` (`Recording.stated`).
     """
     observed = evaluate(record.calibrated.arm, capture, noise=record.noise).observed
     assert observed is not None
@@ -126,7 +136,7 @@ def with_readings_of_arm(record: CalibrationRecord, capture: Capture) -> tuple[C
     best, corrected = check.best, corrected_capture(capture, check.best)
     if not check.explained or check.fits or check.others or corrected is None:
         return capture, ()
-    if any(best.offsets):
+    if any(best.offsets) or set(best.hypothesis.changed) & set(stated):
         return capture, (f"The readings do not match the calibrated arm, unless {explanation_words(best)}.",)
     says = f"The readings were corrected to match the calibrated arm: {explanation_words(best)}."
     return corrected, (f"{says} To state this in the manifest: {_line(best)}.",)
@@ -154,6 +164,23 @@ def corrected_capture(capture: Capture, explanation: Explanation) -> Capture | N
 
     parts = tuple(changed(part) for part in capture.observations)
     return eqx.tree_at(lambda c: (c.q, c.observations), capture, (readings(capture.q), parts))
+
+
+def _stated(recording: Recording, explanation: Explanation) -> list[str]:
+    """What an explanation would change of what somebody stated: in the manifest, or of the zeros by options or the
+    arm's file."""
+    keys = {
+        name: f"{name} of [angles]" if name != "units" else "units of the points"
+        for name in explanation.hypothesis.changed
+    }
+    stated = [text for name, text in keys.items() if name in recording.stated]
+    nominal, zeros = recording.nominal, [f"theta_{i}" for i, zero in enumerate(explanation.offsets, start=1) if zero]
+    if zeros and "bounds" in nominal.stated:
+        stated.append(f"bounds of {listed(zeros)}")
+    elif "parameters" in nominal.stated:
+        fixed = [name for name in zeros if name not in nominal.space().names]
+        stated += [f"{listed(fixed)} as fixed"] if fixed else []
+    return stated
 
 
 def _with_zeros(arm: Arm, explanation: Explanation) -> Arm:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..acceptance.record import EvaluationRecord, PointsRecord
 from ..acceptance.results import AcceptanceTest
-from ..calibration.evaluation import Evaluation, evaluate
+from ..calibration.evaluation import Evaluation
 from ..core.text import pluralise
 from ..data.capture import ReferenceLength
 from ..data.recording import ProbedSphere
@@ -37,11 +37,7 @@ def evaluation_report(record: EvaluationRecord) -> Report:
     """The report, except for the origin of its file."""
     tests, capture, arm = record.acceptance(), record.recording.capture, record.calibrated.arm
     summary = evaluation_summary(record, tests)
-    noise = None if record.uncertainty is None or not capture.observations else record.uncertainty.noise
-    evaluations = {
-        stage: evaluate(arm.arm, capture, noise=noise if stage == "calibrated" else None)
-        for stage, arm in record.arms().items()
-    }
+    evaluations = record.evaluations(capture)
     calibrated = evaluations["calibrated"]
     geometry = {} if calibrated.observed is None else calibrated.observed.geometry
     sockets = [socket_table(capture, calibrated)] if capture.names else []

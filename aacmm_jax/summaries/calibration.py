@@ -32,6 +32,7 @@ from ..kinematics.parameters import ArmSpecification
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.covariance import SharedErrors
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
+from .cameras import camera_rows, image_rows
 from .observations import capture_observations, observed_summary
 from .tables import attributes, plain, rows_of
 from .verdicts import calibration_verdict, checked_lengths
@@ -98,6 +99,7 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
         "poses": len(q),
         "sockets": rows_of(socket=capture.names, poses=capture.sizes),
         "observations": capture_observations(capture),
+        "images": image_rows(recording),
         "lengths": reference_length_rows(capture.lengths, u_mm=[float(length.u) for length in capture.lengths]),
         "ranges": [
             {"joint": i, f"lowest_{unit}": low, f"highest_{unit}": high}
@@ -206,6 +208,7 @@ def calibration_summary(record: CalibrationRecord, volume: VolumetricUncertainty
         "shared_errors": None if record.shared is None else shared_rows(record.shared),
         "findings": finding_rows(findings),
         "warnings": sentences(findings),
+        "cameras": camera_rows(record),
         **observed_summary(record, evaluations["nominal"]),
     }
     if "true" in vectors:

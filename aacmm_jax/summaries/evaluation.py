@@ -9,7 +9,7 @@ from ..acceptance.judgement import RULES, Rule, deciding_uncertainty
 from ..acceptance.record import EvaluationRecord, PointsRecord, check_geometry, unstated_uncertainty_warning
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
 from ..calibration.agreement import NOTHING, Agreement
-from ..calibration.evaluation import Evaluation, evaluate
+from ..calibration.evaluation import Evaluation
 from ..calibration.prediction import unseen_errors
 from ..core.errors import InputError
 from ..core.text import common_labels
@@ -52,7 +52,7 @@ def evaluation_summary(
         "warnings": list(record.warnings),
         "calibration_unusable": record.calibration_unusable,
     }
-    whole = _evaluated(record, capture)
+    whole = record.evaluations(capture)
     rows = metrics_by_socket_and_length(capture, whole["calibrated"])
     for group in _GROUPS:
         wanted = group == "identified_from"
@@ -62,7 +62,7 @@ def evaluation_summary(
             summary[group] = None
             continue
         part = None if not names else capture if len(names) == len(names_in(capture)) else part_of(capture, names)
-        parts = whole if part is capture else {} if part is None else _evaluated(record, part)
+        parts = whole if part is capture else {} if part is None else record.evaluations(part)
         summary[group] = {stage: _grouped(parts.get(stage), whole[stage], lengths) for stage in whole} | {
             "sockets": [row for row in rows["sockets"] if row["socket"] in names],
             "observations": _observation_rows(parts),
@@ -78,16 +78,6 @@ def evaluation_summary(
     summary |= _judged(record, tests)
     summary["verdict"] = evaluation_verdict(summary, len(summary["warnings"]))._asdict()
     return summary | {"calibration_warnings": list(record.calibration_warnings)}
-
-
-def _evaluated(record: EvaluationRecord, capture: Capture) -> dict[str, Evaluation]:
-    """Both arms on a capture. Only the calibrated one is weighted by the noise of the calibration: the nominal arm's
-    errors are not that noise, and weighted by it, its distances would not be the least that it reaches."""
-    noise = None if record.uncertainty is None or not capture.observations else record.uncertainty.noise
-    return {
-        stage: evaluate(specification.arm, capture, noise=noise if stage == "calibrated" else None)
-        for stage, specification in record.arms().items()
-    }
 
 
 def _grouped(part: Evaluation | None, whole: Evaluation, lengths: list[int]) -> dict[str, Any]:

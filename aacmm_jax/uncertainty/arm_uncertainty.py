@@ -19,6 +19,7 @@ from .between_groups import BetweenGroups
 from .covariance import SharedErrors
 from .coverage import LEVEL
 from .degrees_of_freedom import Components, Law, coverage_factor, degrees_of_freedom
+from .kept_geometry import KeptGeometry
 from .shared_kinds import PLACES, SUCCESSIVE, VISITS
 
 
@@ -53,6 +54,8 @@ class Uncertainty(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     scatter_degrees_of_freedom: float = eqx.field(static=True)  # of the noise; infinite where it was given
     lengths: int = eqx.field(static=True, default=0, kw_only=True)  # from which k was found
+    # What an evaluation keeps of the geometry that the calibration found; None: everything is fitted.
+    kept: KeptGeometry | None = eqx.field(default=None, kw_only=True)
     # How poses of groups that were held out agree with their prediction; None: no groups were.
     between: BetweenGroups | None = eqx.field(default=None, kw_only=True)
 

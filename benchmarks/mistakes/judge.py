@@ -21,7 +21,7 @@ from scipy.optimize import brentq
 from scipy.stats import chi2, ncx2
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.record import CalibrationRecord, record_of
+from aacmm_jax.calibration.record import CalibrationRecord, Removed, record_of
 from aacmm_jax.diagnostics.findings import Finding, case_of, findings_of
 
 from .cases import CASES
@@ -130,24 +130,47 @@ def run(kind: str | None, case: str, size: float, seed: int = 1) -> dict[str, An
             code = "refused" if isinstance(error, aj.InputError) else "crashed"
             findings, record = [Finding(code, str(error).replace(folder, ""), severity="unusable")], None
     texts = [f"{finding.code}: {finding.sentence} [{'; '.join(finding.concerns)}]" for finding in findings]
+    decisions = [] if record is None else [*record.decisions, *map(_left_out, record.removed)]
     over = math.nan if record is None else beyond_u(trial, record)
     return {
-        "severity": findings[0].severity if findings else "",
+        "severity": next((s for s in ("unusable", "doubt", "note") if s in {f.severity for f in findings}), ""),
         "over_u": round(over, 3) if math.isfinite(over) else None,
         "findings": texts,
+        "decisions": decisions,
         "culprit": trial.culprit,
         "cpu": round(time.process_time() - started, 2),
     }
 
 
 def rank_of(row: dict[str, Any]) -> int | None:
-    """At which place the findings of a line name what is wrong; None where none of them does."""
+    """At which place the findings of a line name what is wrong; None where none of them does. A decision of the default
+    that names it stands before all of them."""
     if row["kind"] == SOUND:
         return None
     names = {name: re.escape(value) for name, value in row["culprit"].items()}
     patterns = [pattern.format(**names) for pattern in KINDS[row["kind"]].right]
-    right = (n for n, text in enumerate(row["findings"], start=1) if any(re.search(p, text) for p in patterns))
-    return next(right, None)
+
+    def names_it(text: str) -> bool:
+        return any(re.search(pattern, text) for pattern in patterns)
+
+    if any(map(names_it, row.get("decisions", ()))):
+        return 1
+    return next((n for n, text in enumerate(row["findings"], start=1) if names_it(text)), None)
+
+
+def _left_out(removed: Removed) -> str:
+    return f"left-out: {removed.kind} {removed.group} [{'; '.join(removed.members)}]"
+
+
+def _as_corrected(readings: np.ndarray, trial: Trial, record: CalibrationRecord) -> np.ndarray:
+    """Readings with the order, signs and unit to which the calibration corrected those of the capture: an arm that is
+    used as its calibration says is read so too."""
+    before, after = trial.readings, np.asarray(record.recording.capture.readings)[:, : trial.joints]
+    for misread in trial.misread:
+        before = misread(before)
+    if not any("readings were corrected" in says for says in record.decisions) or before.shape != after.shape:
+        return readings
+    return readings @ np.linalg.lstsq(before, after, rcond=None)[0]
 
 
 def beyond_u(trial: Trial, record: CalibrationRecord) -> float:
@@ -165,7 +188,7 @@ def beyond_u(trial: Trial, record: CalibrationRecord) -> float:
     far = true_length > 0.05 * true_length.max()
     start, end, true_length = start[far], end[far], true_length[far]
     noise = trial.encoder_factor * math.radians(trial.case.encoder_arcsec / 3600) * trial.random.normal(size=q.shape)
-    readings, uncertainty = trial.in_use(q) + noise, aj.uncertainty_of(record)
+    readings, uncertainty = _as_corrected(trial.in_use(q) + noise, trial, record), aj.uncertainty_of(record)
     shown = np.asarray(record.calibrated.arm.position(readings))
     errors = np.linalg.norm(shown[start] - shown[end], axis=1) - true_length
     with np.errstate(all="ignore"):

@@ -11,6 +11,7 @@ import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.core.rotations import rotation_matrix
 from aacmm_jax.data import observations as kinds
+from aacmm_jax.data.cameras.camera import camera_models
 from aacmm_jax.data.observations.geometry import distances_from_axis, fitted_cylinder, placed
 from aacmm_jax.data.observations.held import platform_frames
 from aacmm_jax.data.observations.observation import (
@@ -33,6 +34,27 @@ TURNED = STATION.inv() * Rotation.from_matrix(AXES) * Rotation.from_rotvec([0.5,
 MEASURED = (TURNED * Rotation.from_rotvec(0.01 * RANDOM.normal(size=(POSES, 3)))).as_matrix()
 CORNERS = {"a": [0, 0, 0], "b": [100, 0, 0], "c": [3, 4, 100]}
 IN_CORNERS = {"a": Q[:4], "b": Q[4:8], "c": Q[8:]}
+
+# Points before the cameras, which the target has elsewhere in every pose; a camera with focal lengths of about 1 px.
+BEFORE = RANDOM.uniform([-200, -200, 400], [200, 200, 900], (POSES, 6, 3))
+MOUNT = AXES @ Rotation.from_rotvec([0.5, 0.2, -0.7]).as_matrix()
+IN_SPACE = {
+    True: STATION.inv().apply((TIPS.position.T[:, None] + BEFORE @ MOUNT.swapaxes(1, 2) - ORIGIN).reshape(-1, 3)),
+    False: ((STATION.apply(BEFORE.reshape(-1, 3)) + ORIGIN).reshape(-1, 6, 3) - TIPS.position.T[:, None]) @ MOUNT,
+}
+IDS = np.where(np.arange(6 * POSES).reshape(POSES, 6) % 17 == 16, -1, np.arange(6))
+LENS = [1.1, 1.2, 0.4, 0.3, -0.1, 0.05, 0.001, 0.002, 0.02, 0.01, 0.02, 0.003]
+
+
+def picture(model, count, on_arm=True, **options):
+    """Corners as a camera has them that is nearly where `MOUNT` or `STATION` say."""
+    lens, points = np.array(LENS[:count]), IN_SPACE[on_arm].reshape(POSES, 6, 3)
+    values = camera_models()[model].project(np.moveaxis(BEFORE, -1, 0), lens[:, None, None]).values
+    corners, names = np.moveaxis(values, 0, -1) + 1e-3, ("eye", "board")
+    options = dict(on_arm=on_arm, model=model, intrinsics=lens) | options
+    return kinds.Pixels("v", Q, corners, points, IDS, 1e-3, *names, **options)
+
+
 ALL = {
     "socket": kinds.Socket("A", Q),
     "points": kinds.MeasuredPoints("p", Q, POINTS, u=[0.1, 0.2, 0.3]),
@@ -51,6 +73,11 @@ ALL = {
     "indexed artefact": kinds.Artefact("t", CORNERS, IN_CORNERS, u=0.1, index="1"),
     "distances": kinds.Distances("d", Q, np.linalg.norm(TIPS.position, axis=0), u=0.1),
     "distances with a constant": kinds.Distances("d", Q, np.linalg.norm(TIPS.position, axis=0), constant=True),
+    "camera on the arm": picture("pinhole", 9, u_intrinsics=[0, *[0.1] * 4, *[np.inf] * 4], u_scale=1e-4),
+    "fixed camera": picture("pinhole", 12, on_arm=False, u_intrinsics=0.1),
+    "fisheye": picture("fisheye", 8, u_intrinsics=np.inf),
+    "fixed fisheye": picture("fisheye", 8, on_arm=False, u_scale=1e-4),
+    "stereo rig": picture("points", 0, u_scale=1e-4),
 }
 
 
@@ -121,6 +148,18 @@ def check_derivatives(observation, unknowns):
 BOX = [[200, -300, 100], [600, 300, 500]]
 FRAME = (0.1, 0.2, 3.0, 1000.0, 2000.0, -300.0)
 BAR = {"a": (0, 0, 0), "b": (300, 0, 0), "c": (0, 200, 0)}
+
+
+def simulated_picture(name="v", board="board", **changed):
+    points = [(30 * i, 30 * j, 0) for j in range(4) for i in range(6)]
+    held, still = (10, 20, 80, 0.1, 0.2, 0.3), (0.1, -2.9, 0.2, 500, 50, -50)
+    if not changed.get("on_arm", True):
+        still = (0, 0.3, 0, 400, 0, -300)
+    options = dict(intrinsics=(600, 610, 320, 240), image_size=(640, 480), mount=held, frame=still, u=1e-9, tilt=1.2)
+    options |= {"distance": (150, 600)} | changed
+    return kinds.SimulatedPixels(name, 8, f"camera {name}", board, points, **options)
+
+
 SIMULATED = [
     kinds.SimulatedPoints("T", BOX, 12, FRAME, target="smr", place=(10, 20, 80)),
     kinds.SimulatedTransforms("T6", BOX, 12, (10, 20, 80, 0.1, 0.2, 0.3), FRAME, u_angle=1e-12),
@@ -131,6 +170,9 @@ SIMULATED = [
     kinds.SimulatedPlanes("p", (300, -100, 200), [(0, 200, 0), (150, 0, 60)], 6, distance=40.0),
     kinds.SimulatedArtefact("bar", BAR, 4, (0.3, 0, 1.5, 350, -100, 250)),
     kinds.SimulatedDistances("d", BOX, 12, (900, 300, 100)),
+    simulated_picture(),
+    simulated_picture("fixed", "gripper board", on_arm=False, model="fisheye", intrinsics=(200, 210, 320, 240)),
+    simulated_picture("rig", "other board", model="points", intrinsics=()),
 ]
 
 
@@ -232,10 +274,11 @@ def test_every_number_of_a_geometry_can_be_read(name):
     for part, values in unknowns_of(observation).items():
         if part in observation.unknowns:
             quantities = observation.quantities(part, values[:, 0])
-            assert {quantity.unit for quantity in quantities} <= {"mm", "rad", "1"}
+            assert {quantity.unit for quantity in quantities} <= {"mm", "rad", "px", "1"}
             assert len({quantity.says for quantity in quantities}) == len(quantities)
             count = sum(len(quantity.values) for quantity in quantities)
-            directions = sum(quantity.unit == "1" for quantity in quantities)  # three numbers for two unknown ones
+            # three numbers for two unknown ones
+            directions = sum(quantity.says in ("normal", "direction of the axis") for quantity in quantities)
             points = sum(quantity.says == "point of the axis" for quantity in quantities)
             assert count == len(values) + directions + points
 

@@ -158,9 +158,10 @@ def test_what_is_linear_has_derivatives_that_depend_on_nothing(name):
 
 
 def test_only_those_are_alike_that_have_the_same_rows():
-    """What decides by a mean over its poses, or has points of its own, is alone."""
+    """What decides by a mean over its poses, has points of its own, or many rows, is alone."""
     assert {name for name, one in ALL.items() if one.alike is None} == {
-        "planes", "exact planes", "artefact", "indexed artefact"
+        "planes", "exact planes", "artefact", "indexed artefact",
+        "camera on the arm", "fixed camera", "fisheye", "fixed fisheye", "stereo rig",
     }  # fmt: skip
     assert len({one.alike for one in SPHERES}) == len(SPHERES)
     inside = [kinds.Cylinder("c", ALL["plane"].q, diameter=50, inside=inside).alike for inside in (False, True)]

@@ -37,7 +37,7 @@ def with_lengths(capture, *lengths):
         (1000, "Is the arm in m, or are the reference lengths in um by mistake?"),
         (25.4, "Is the arm in inches by mistake?"),
         (3.0, "Check units, sockets, lengths and arm."),
-        (1.02, "far from 1"),
+        (1.02, "the scale of the lengths (A - B) is wrong"),
     ],
 )
 def test_a_wrong_reference_length(paper_arm, noisy_capture, factor, said):

@@ -545,6 +545,25 @@ def test_what_is_not_a_manifest(tmp_path):
     assert_refused(lambda: aj.files.read_manifest(tmp_path), tmp_path, "is a folder", "give a file")
 
 
+@pytest.mark.parametrize(
+    ("angles", "socket", "stated"),
+    [
+        ('unit = "deg"', "", ("unit",)),
+        ('unit = "deg", sign = 1, offset = 0', "", ("offset", "sign", "unit")),
+        ('unit = "deg"', 'units = { q = "deg" }, columns = { q = "*" }', ("columns", "unit")),
+    ],
+)
+def test_what_is_stated_of_the_readings(tmp_path, motion, angles, socket, stated):
+    np.savetxt(tmp_path / "a.csv", np.degrees(motion), delimiter=",")
+    socket = f'{{ name = "A", file = "a.csv"{", " if socket else ""}{socket} }}'.replace('"*"', str([*range(1, 7)]))
+    text = f'arm = "cheng2018-simulation"\nangles = {{ {angles} }}\nsocket = [{socket}]\n'
+    (tmp_path / "capture.toml").write_text(text)
+    recording = aj.files.read_manifest(tmp_path / "capture.toml")
+    assert recording.stated == stated
+    aj.files.save_capture(tmp_path / "capture.h5", recording)
+    assert aj.files.load_capture(tmp_path / "capture.h5").stated == stated
+
+
 def test_the_time_of_day_of_a_date_is_left_out(tmp_path, motion):
     (tmp_path / "capture.toml").write_text("date = 2026-01-02T10:00:00\n" + SMALL)
     assert aj.files.read_manifest(tmp_path / "capture.toml").measured == "2026-01-02"

@@ -64,7 +64,20 @@ def make(kind, draw, some):
         "distances": lambda: kinds.Distances(
             "x", q, draw.uniform(1, 900, m), u=draw.uniform(0, 1, m) if some else 0.1, constant=some, target=target
         ),
+        "pixels": lambda: pixels(draw, q, some, target),
     }[kind]()
+
+
+def pixels(draw, q, some, target):
+    """Corners of a flat board, of which some are absent."""
+    points = np.tile([[0, 0, 0], [90, 0, 0], [90, 60, 0], [0, 60, 0], [30, 30, 0], [60, 30, 0.0]], (len(q), 1, 1))
+    away = points + np.array([-40.0, -30.0, 400.0]) + draw.normal(size=(len(q), 1, 3))
+    corners = 600 * away[..., :2] / away[..., 2:] + 300 + 0.1 * draw.normal(size=away[..., :2].shape)
+    ids = np.tile(np.arange(6), (len(q), 1))
+    ids[:, 5] = -1 if some else 5
+    optional = {"u_intrinsics": [np.inf, np.inf, 1.0, 0.0], "u_scale": 1e-3, "image_size": (640, 480)} if some else {}
+    optional |= {"images": [f"img_{i}.png" for i in range(len(q))], "on_arm": False} if some else {}
+    return kinds.Pixels("x", q, corners, points, ids, 0.1, "eye", "board", intrinsics=[600, 600, 300, 300], **optional)
 
 
 def same(one, other):

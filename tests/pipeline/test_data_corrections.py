@@ -72,6 +72,11 @@ def test_what_is_stated_stays():
     assert record.recording.nominal.prior == prior
 
 
+def test_no_prior_where_none_is_asked_for():
+    with pytest.raises(aj.InputError, match="equations"):
+        aj.calibrate_capture(recorded("ur10e", 8)[0], prior=None, **OPTIONS)
+
+
 def test_enough_points_have_none():
     record = aj.calibrate_capture(recorded("ur10e", 14)[0], model="dh", **OPTIONS)
     assert record.prior is None
@@ -116,6 +121,35 @@ def test_wrong_readings_are_corrected(mistake, says):
         assert float(record.calibrated.arm.theta[2] - true.theta[2]) == pytest.approx(-0.5, abs=2e-4)
     else:
         assert errors(record, true)[1] < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("mistake", "stated", "said"),
+    [
+        (exchanged, ("columns",), "columns of [angles]"),
+        (turned, ("columns", "sign"), "sign of [angles]"),
+        (shifted, ("offset",), "offset of [angles]"),
+        (in_metres, ("unit", "units"), "units of the points"),
+        (shifted, "bounds", "bounds of theta_3"),
+        (shifted, "parameters", "theta_3 as fixed"),
+    ],
+)
+def test_what_is_stated_by_hand_is_not_corrected(mistake, stated, said):
+    recording, _ = recorded("ur10e", 40, mistake)
+    if isinstance(stated, str):  # of the arm
+        nominal = recording.nominal._replace(stated=(stated,))
+        held = (*nominal.space().held, "theta_3") if stated == "parameters" else nominal.held
+        recording = recording._replace(nominal=nominal._replace(held=held))
+    else:
+        recording = recording._replace(stated=stated)
+    record = aj.calibrate_capture(recording, model="dh", **OPTIONS)
+    assert any(f"because this differs from what is stated: {said}." in says for says in record.decisions)
+    # A zero that is not in the readings is found as one of the arm, within default bounds that are widened.
+    assert record.implausible_residual != (stated == ("offset",))
+    read, given = record.recording.capture.observations[0], recording.capture.observations[0]
+    assert np.array_equal(read.q, given.q)
+    assert np.array_equal(read.points, given.points)
 
 
 @pytest.mark.slow

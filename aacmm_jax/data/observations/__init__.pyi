@@ -1,3 +1,6 @@
+from .corner_tables import Camera as Camera
+from .corner_tables import CornerTable as CornerTable
+from .corner_tables import pixels_of as pixels_of
 from .held import Artefact as Artefact
 from .held import SimulatedArtefact as SimulatedArtefact
 from .held import SimulatedSocket as SimulatedSocket
@@ -8,6 +11,8 @@ from .measured import MeasuredTransforms as MeasuredTransforms
 from .measured import SimulatedDistances as SimulatedDistances
 from .measured import SimulatedPoints as SimulatedPoints
 from .measured import SimulatedTransforms as SimulatedTransforms
+from .pixels import Pixels as Pixels
+from .simulated_pixels import SimulatedPixels as SimulatedPixels
 from .touched import Cylinder as Cylinder
 from .touched import ParallelPlanes as ParallelPlanes
 from .touched import Plane as Plane

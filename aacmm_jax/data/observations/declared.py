@@ -12,18 +12,21 @@ from dataclasses import FrozenInstanceError
 from typing import Any, ClassVar, Literal, NamedTuple, get_args, get_origin
 
 import numpy as np
+from jaxtyping import Float
 
 from ...core.arguments import Range, Sizes, checked, shown
 from ...core.arrays import Numbers, as_array, as_floats, is_concrete
 from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 
+FREE = 1e12  # standard uncertainty of a value that is only a start: it counts as no equation
 MOST_POSES = 100_000  # to simulate, as in a study
 REQUIRED = inspect.Parameter.empty
 NAME = object()  # as a default: the name of the observation
-Content = Literal["number", "count", "text", "truth", "points"]
-_CONTENTS: dict[Any, Content] = {str: "text", bool: "truth", int: "count", dict: "points"}
-_ARGUMENTS = {"number": "Numbers", "count": "int", "text": "str", "truth": "bool", "points": "dict"}
+Content = Literal["number", "count", "text", "truth", "points", "ids"]
+Identifiers = tuple[tuple[int, ...], ...]  # whole numbers of each pose, as many for each
+_CONTENTS: dict[Any, Content] = {Identifiers: "ids", str: "text", bool: "truth", int: "count", dict: "points"}
+_ARGUMENTS = {"number": "Numbers", "count": "int", "text": "str", "truth": "bool", "points": "dict", "ids": "Numbers"}
 
 
 class Entry(NamedTuple):
@@ -36,6 +39,7 @@ class Entry(NamedTuple):
     uncertainty: str = ""  # of a certified value: name of the entry with its standard uncertainty
     positive: bool = False  # a single number may not be 0
     spread: int | None = None  # of an array: with so many of its last dimensions it is the same for all poses
+    most: float | None = None  # of numbers: larger ones, infinite ones too, count as this
     of_session: bool = False  # a name that means something else in another session
     moves: Literal["", "point", "vector", "frame"] = ""  # with what is simulated, where that is placed elsewhere
     more: str = ""  # of its description, for whoever calls the constructor
@@ -44,8 +48,9 @@ class Entry(NamedTuple):
 
     @property
     def content(self) -> Content:
-        """By its type: number, count, text, truth or points (a dictionary of points by name)."""
-        alternatives = (get_origin(self.annotation), self.annotation, *get_args(self.annotation))
+        """By its type: number, count, text, truth, points (a dictionary of points by name) or ids (whole numbers)."""
+        alternatives = [get_origin(self.annotation), self.annotation, *get_args(self.annotation)]
+        alternatives += [part for inner in alternatives for part in get_args(inner)]
         contents: list[Content] = [_CONTENTS[kind] for kind in alternatives if kind in _CONTENTS]
         return contents[0] if contents else "number"
 
@@ -67,6 +72,13 @@ class Entry(NamedTuple):
     def row_shape(self) -> tuple[int, ...]:
         """Of an array with a row for each pose, the shape of a row: along each dimension 3, unless annotated."""
         return tuple(map(int, self._sizes[1:])) if self._sizes else (3,) * (len(self.dimensions) - 1)
+
+    def shape(self, sizes: Sizes) -> tuple[int, ...]:
+        """Of an array with a row for each pose, its shape, by the ``sizes`` of dimensions; else that of the
+        annotation."""
+        if not self.of_poses or not any(size.isidentifier() for size in self._sizes[1:]):
+            return (sizes["m"], *self.row_shape) if self.of_poses else tuple(sizes[size] for size in self._sizes)
+        return tuple(sizes[size] if size in sizes else int(size) for size in self._sizes)
 
     @property
     def required(self) -> bool:
@@ -207,8 +219,12 @@ def _checked(entry: Entry, value: Any, where: str, sizes: Sizes) -> Any:
         return value if value == "" and entry.default == "" else checked_name(value, what)
     if entry.name == "q":
         value = checked_readings(where, value)
+    if entry.most is not None:
+        value = numpy_if_known(lambda values: namespace(values).minimum(values, entry.most))(as_array(value, what))
     if entry.spread is not None:
-        value = _spread(as_floats(value, what), (sizes["m"], *entry.row_shape), entry.spread, what)
+        value = _spread(as_floats(value, what), entry.shape(sizes), entry.spread, what)
+    if content == "ids":
+        return checked_ids(value, what, sizes)
     value = checked(value, entry.annotation, what, sizes)
     if entry.of_poses and len(value) != sizes["m"]:
         raise InputError(f"{what} has {len(value)} values; give one for each of the {sizes['m']} poses.")
@@ -250,6 +266,14 @@ def checked_readings(where: str, readings: Numbers) -> AnyArray:
             f"{where} pose {row} joint {column} is {array[row - 1, column - 1]}; every reading must be finite."
         )
     return array
+
+
+def checked_ids(value: Any, what: str, sizes: Sizes) -> Identifiers:
+    """Whole numbers ``(m, c)``, or `InputError`."""
+    array = np.asarray(checked(value, Float[np.ndarray, "m c"], what, sizes))
+    if not np.array_equal(array, np.round(array)):
+        raise InputError(f"{what} contains a number that is not whole; give whole numbers.")
+    return tuple(map(tuple, array.astype(int).tolist()))
 
 
 def is_exact(u: AnyArray) -> bool:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ...core.errors import InputError
 from ...core.linear_algebra import inverse_positive_definite, products_by_column
@@ -148,6 +148,12 @@ class AbstractObservation(Declared):
         return len(self.row_units)
 
     @property
+    def present(self) -> Bool[np.ndarray, "r m"] | None:
+        """Which residuals there are, where some are absent: these are 0 with derivatives 0 and variance 1, and count
+        nowhere. None where all are there."""
+        return None
+
+    @property
     def lengths(self) -> int:
         """How many of them are in mm: the first ones."""
         return self.row_units.count("mm")
@@ -161,14 +167,7 @@ class AbstractObservation(Declared):
         """Residuals, or their derivatives by k numbers, as a vector whose length is the distance of the tip from the
         geometry, mm: the residuals in mm themselves; of a kind without any, the shortest displacement of the tip that
         changes the residuals so, by their derivatives with respect to the tip."""
-        if self.lengths:
-            return rows[: self.lengths]
-        xp = namespace(rows, by_tip)
-        normal = xp.einsum("ram,rbm->mab", by_tip, by_tip)
-        # Directions of the tip that no residual depends on, such as the line of sight, get no displacement.
-        least = _UNSEEN * xp.einsum("maa->m", normal) + 1e-300
-        inverse = inverse_positive_definite(normal + least[:, None, None] * xp.asarray(np.eye(3))[None])
-        return products_by_column(xp.einsum("mab,rbm->arm", inverse, by_tip), rows)
+        return rows[: self.lengths] if self.lengths else displacement(rows, by_tip)
 
     @property
     def alike(self) -> Hashable | None:
@@ -274,6 +273,16 @@ def _check_row_units(name: str, units: tuple[str, ...]) -> None:
             f"row_units of {name} are {units}; declare the rows in mm first, followed by rows that are all in rad or "
             "all in px."
         )
+
+
+def displacement(rows: Float[AnyArray, "r *k m"], by_tip: Float[AnyArray, "r 3 m"]) -> Float[AnyArray, "3 *k m"]:
+    """The shortest displacement of the tip, mm, that changes rows nearly so, by their derivatives."""
+    xp = namespace(rows, by_tip)
+    normal = xp.einsum("ram,rbm->mab", by_tip, by_tip)
+    # Directions of the tip that no residual depends on, such as the line of sight, get no displacement.
+    least = _UNSEEN * xp.einsum("maa->m", normal) + 1e-300
+    inverse = inverse_positive_definite(normal + least[:, None, None] * xp.asarray(np.eye(3))[None])
+    return products_by_column(xp.einsum("mab,rbm->arm", inverse, by_tip), rows)
 
 
 def quantities_by_unit(units: Sequence[str], values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:

@@ -1,0 +1,1 @@
+"""Camera models, one file each: where points in a camera's frame appear in its image."""

@@ -1,0 +1,185 @@
+"""[[pixels]] in manifests: tables of corners and nested lists, which image belongs to which pose, and bad input."""
+
+import json
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from tests.refusals import assert_refused
+
+TARGET = '[[target]]\nname = "board"\nkind = "charuco"\nsquares = [6, 5]\nsize = 30.0\nmarker = 22.0\n'
+CAMERA = '[[camera]]\nname = "webcam"\nimage_size = [640, 480]\n'
+PIXELS = '[[pixels]]\ncamera = "webcam"\ntarget = "board"\nfile = "joints.csv"\ncorners = "corners.csv"\n'
+JOINTS = [f"q_{i}_deg" for i in range(1, 7)]
+
+
+@pytest.fixture(scope="module")
+def seen():
+    board = aj.camera.target_of("charuco", squares=[6, 5], size=30.0, marker=22.0)
+    eye = aj.data.observations.SimulatedPixels(
+        "eye", 12, "webcam", "board", board.points, (600.0, 610.0, 319.5, 239.5), (640, 480),
+        frame=(np.pi, 0, 0, -700, -200, 0), mount=(60, 0, 20, 0, 0, 0), distance=(250, 400), u=0.2,
+    )  # fmt: skip
+    return aj.simulate(aj.load_arm("ur10e"), {}, observations=[eye], seed=1).observations[0]
+
+
+def files(tmp_path, seen, *, images=True, first="", order=None, corners="corners.csv"):
+    """Write a table of readings and one of corners."""
+    order = range(len(seen.q)) if order is None else order
+    rows = [",".join([f"img_{i}.png", *map(str, np.degrees(seen.q[i]))]) for i in order]
+    rows = rows if images else [row.split(",", 1)[1] for row in rows]
+    (tmp_path / "joints.csv").write_text(",".join(["image"] * images + JOINTS) + "\n" + "\n".join(rows) + "\n")
+    name = "img_{}.png".format if images else (lambda i: f"{i + 1}")
+    lines = [
+        f"{name(i)},{seen.ids[i][k]},{u:.6f},{v:.6f}"
+        for i in range(len(seen.q))
+        for k, (u, v) in enumerate(np.asarray(seen.corners[i]))
+    ]
+    (tmp_path / corners).write_text("image,id,u,v\n" + first + "\n".join(lines) + "\n")
+
+
+def read(tmp_path, text=TARGET + CAMERA + PIXELS, changes=()):
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new)
+    (tmp_path / "capture.toml").write_text('arm = "ur10e"\n' + text)
+    return aj.files.read_manifest(tmp_path / "capture.toml")
+
+
+@pytest.mark.parametrize("images", [True, False])
+def test_a_table_of_corners_is_read_and_comes_back_from_a_file(tmp_path, seen, images):
+    order = [3, 0, 1, 2, *range(4, 12)] if images else None
+    files(tmp_path, seen, images=images, order=order)
+    recording = read(tmp_path)
+    (pixels,) = recording.capture.observations
+    expected = np.asarray(seen.corners)[list(order or range(12))]
+    np.testing.assert_allclose(pixels.corners, expected, atol=1e-6)
+    np.testing.assert_allclose(pixels.points, seen.points)
+    assert (pixels.camera, pixels.board, pixels.on_arm, pixels.target) == ("webcam", "board", True, "webcam")
+    assert np.all((pixels.u > 0.15) & (pixels.u < 0.25))  # not stated, so by the scatter
+    assert [image.corners for image in recording.images] == [20] * 12
+    aj.files.save_capture(tmp_path / "capture.h5", recording)
+    loaded = aj.files.load_capture(tmp_path / "capture.h5")
+    assert loaded.images == recording.images
+    for name in ("q", "corners", "points", "u", "intrinsics", "u_intrinsics", "views"):
+        np.testing.assert_array_equal(getattr(loaded.capture.observations[0], name), getattr(pixels, name))
+    assert loaded.capture.observations[0].ids == pixels.ids
+
+
+@pytest.mark.parametrize("lists", ["all", "ids", "points", "plain"])
+def test_nested_lists(tmp_path, seen, lists):
+    files(tmp_path, seen, images=False)
+    corners = np.asarray(seen.corners)[:, :, None, :].tolist()
+    points, ids = np.asarray(seen.points).tolist(), [list(row) for row in seen.ids]
+    content = {
+        "all": {"image_points": corners, "object_points": points, "ids": ids},
+        "ids": {"corners": corners, "ids": ids},
+        "points": {"imgpoints": corners, "objpoints": points},
+        "plain": corners,
+    }[lists]
+    (tmp_path / "corners.json").write_text(json.dumps(content))
+    (pixels,) = read(tmp_path, changes=[("corners.csv", "corners.json")]).capture.observations
+    np.testing.assert_allclose(pixels.corners, seen.corners)
+    np.testing.assert_allclose(pixels.points, seen.points)
+
+
+def test_absent_corners_and_images(tmp_path, seen):
+    files(tmp_path, seen)
+    lines = (tmp_path / "corners.csv").read_text().splitlines()
+    few = [line for line in lines if not line.startswith("img_7.png") or line.split(",")[1] in ("1", "2", "3")]
+    kept = [line for line in few if not line.startswith("img_4.png,5,")]
+    (tmp_path / "corners.csv").write_text("\n".join([*kept, "other.png,1,10,10"]) + "\n")
+    recording = read(tmp_path)
+    (pixels,) = recording.capture.observations
+    assert pixels.corners.shape == (11, 20, 2)
+    assert pixels.seen.sum(axis=1).tolist() == [20] * 4 + [19] + [20] * 6
+    refused = {image.image: image.refused for image in recording.images if image.refused}
+    assert refused.keys() == {"img_7.png", "other.png"}
+    assert "3 corners" in refused["img_7.png"]
+    assert "no row" in refused["other.png"]
+    aj.files.save_capture(tmp_path / "capture.h5", recording)
+    assert aj.files.load_capture(tmp_path / "capture.h5").capture.observations[0].ids == pixels.ids
+
+
+def test_what_is_known_of_the_camera(tmp_path, seen):
+    files(tmp_path, seen)
+    stated = "intrinsics = { fx = 600, fy = 610, cx = 319.5, cy = 239.5 }\nu = { fx = 2.0, fy = 2.0 }\n"
+    (pixels,) = read(tmp_path, TARGET + CAMERA + stated + PIXELS).capture.observations
+    assert pixels.intrinsics.tolist() == [600, 610, 319.5, 239.5]
+    assert pixels.u_intrinsics.tolist() == [2, 2, 0, 0]
+    info = "image_width: 640\nimage_height: 480\nk: [600, 0, 320, 0, 610, 240, 0, 0, 1]\nd: [0, 0, 0, 0, 0]\n"
+    (tmp_path / "info.yaml").write_text(info)
+    (pixels,) = read(tmp_path, TARGET + CAMERA + 'file = "info.yaml"\nu = "exact"\n' + PIXELS).capture.observations
+    assert pixels.intrinsics.tolist() == [600, 610, 320, 240, 0, 0, 0, 0, 0]
+    assert not pixels.u_intrinsics.any()
+
+
+BAR = "bar = { nominal = 150.0, measured = 150.3, u = 0.05 }\n"
+
+
+def test_a_measured_bar_scales_the_points(tmp_path, seen):
+    files(tmp_path, seen)
+    (pixels,) = read(tmp_path, TARGET + BAR + CAMERA + PIXELS).capture.observations
+    np.testing.assert_allclose(pixels.points, 1.002 * np.asarray(seen.points))
+    assert pixels.u_scale == pytest.approx(0.05 / 150)
+
+
+@pytest.mark.parametrize(
+    ("changes", "parts"),
+    [
+        ([("size = 30.0", "size = 0.03"), ("marker = 22.0", "marker = 0.022")], ["mm", "0.03"]),
+        ([("squares = [6, 5]", "squares = [5, 5]")], ["img_0.png", "point id 16", "0 to 15"]),
+        ([("[640, 480]", "[320, 240]")], ["outside of the image", "320 x 240"]),
+        ([('target = "board"', 'target = "bord"')], ["'bord'", "did you mean 'board'"]),
+        ([('camera = "webcam"', 'camera = "web"')], ["'web'", "did you mean 'webcam'"]),
+        ([("[640, 480]\n", '[640, 480]\nmodel = "pinhol"\n')], ["pinhol", "pinhole"]),
+        ([("[640, 480]\n", "[640, 480]\nintrinsics = { fx = 600 }\n")], ["fy, cx, cy"]),
+        ([("[640, 480]\n", "[640, 480]\nintrinsics = { f = 600 }\n")], ["no 'f'"]),
+        ([("[640, 480]\n", '[640, 480]\nu = "exact"\n')], ["not given"]),
+        ([("[640, 480]\n", "[640, 480]\nintrinsics = { fx = 600, fy = 600, cx = 320, cy = 240, k1 = -40 }\n"
+                           'u = "exact"\n')], ["folds"]),
+        ([('corners = "corners.csv"\n', "")], ["images or corners"]),
+        ([('kind = "charuco"', 'kind = "charuko"')], ["charuco"]),
+    ],
+)  # fmt: skip
+def test_a_manifest_that_makes_no_sense_is_refused(tmp_path, seen, changes, parts):
+    files(tmp_path, seen)
+    assert_refused(lambda: read(tmp_path, changes=changes), *parts)
+
+
+@pytest.mark.parametrize(
+    ("table", "old", "new", "parts"),
+    [
+        ("joints.csv", "img_1.png", "img_2.png", ["rows 2 and 3", "img_2.png"]),
+        ("joints.csv", "img_1.png", "img_99.png", ["row 2", "img_99.png"]),
+        ("corners.csv", "img_1.png,3", "img_1.png,4", ["img_1.png", "point id 4 twice"]),
+        ("corners.csv", "img_1.png,3", "img_1.png,3.5", ["3.5"]),
+        ("corners.csv", "image,id,u,v", "image,id,a,b", ["corner_columns"]),
+    ],
+)
+def test_tables_that_make_no_sense_are_refused(tmp_path, seen, table, old, new, parts):
+    files(tmp_path, seen)
+    text = (tmp_path / table).read_text()
+    assert old in text
+    (tmp_path / table).write_text(text.replace(old, new, 1))
+    assert_refused(lambda: read(tmp_path), *parts)
+
+
+def test_two_images_of_one_pose_are_refused(tmp_path, seen):
+    files(tmp_path, seen, order=[0, *range(1, 12)])
+    lines = (tmp_path / "joints.csv").read_text().splitlines()
+    lines[2] = lines[2].split(",", 1)[0] + "," + lines[1].split(",", 1)[1]
+    (tmp_path / "joints.csv").write_text("\n".join(lines) + "\n")
+    assert_refused(lambda: read(tmp_path), "img_0.png", "img_1.png", "same joint readings")
+
+
+def test_as_many_poses_as_images(tmp_path, seen):
+    files(tmp_path, seen, images=False)
+    lines = (tmp_path / "corners.csv").read_text().splitlines()
+    named = [lines[0], *(f"frame_{line}" for line in lines[1:])]
+    (tmp_path / "corners.csv").write_text("\n".join(named) + "\n")
+    np.testing.assert_allclose(read(tmp_path).capture.observations[0].corners, seen.corners, atol=1e-6)
+    kept = [line for line in named if not line.startswith("frame_5,")]
+    (tmp_path / "corners.csv").write_text("\n".join(kept) + "\n")
+    assert_refused(lambda: read(tmp_path), "11 images and 12 poses")
