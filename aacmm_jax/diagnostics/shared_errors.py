@@ -58,10 +58,7 @@ _FEWEST = 6  # degrees of freedom
 # beforehand. Three lengths say so little that it decides how wide intervals are: a seat that shifts by several times
 # what single poses scatter is common, and a smaller scale costs coverage there (`benchmarks/NOTES.md`).
 _USUAL = 2.5
-# Probability beforehand that places err at all: even odds where several differences between lengths show them. A single
-# difference (two lengths) may as well be that of one wrong length, and says so little that with even odds U would be
-# several times too large in one sound capture of ten (`benchmarks/NOTES.md`).
-_SEVERAL, _ONE_DIFFERENCE = 0.5, 0.15
+_EVEN = 6.0  # square of the number of differences between lengths at which it is as likely as not that places err
 
 
 def amend(result: Calibration, case: Case, sensitivities: Callable[[], Sensitivities]) -> Calibration:
@@ -327,5 +324,14 @@ def _places(problem: SharedProblem, effects: Effects) -> _Tips | None:
     whole = float(effects.product(by_poses[:, None], by_poses[:, None])[0, 0])
     if not number or np.sum(squares / values) > _MOST_OF_POSES * whole:
         return None
-    probability = _ONE_DIFFERENCE if number == 1 else _SEVERAL
-    return _tips(problem, effects, PLACES, {np.nan: patterns}, probability)
+    return _tips(problem, effects, PLACES, {np.nan: patterns}, probability_of_places(number))
+
+
+def probability_of_places(differences: int) -> float:
+    """Probability beforehand that places err at all, where so many differences between lengths can show it.
+
+    Many differences decide by themselves. A few say so little that what is expected beforehand decides how wide U is,
+    and a single one may as well be that of a wrong length: with even odds, U would be several times too large in one
+    sound capture of ten (`benchmarks/NOTES.md`).
+    """
+    return differences**2 / (differences**2 + _EVEN)
