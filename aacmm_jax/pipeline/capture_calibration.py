@@ -20,7 +20,13 @@ from ..diagnostics.findings import case_of
 from ..kinematics.corrected_arm import with_corrections
 from ..kinematics.priors import Prior, default_prior
 from ..model.loss_names import LossName
-from .automatic import with_best_model, with_full_couplings, with_wider_bounds, without_contradicting
+from .automatic import (
+    with_best_model,
+    with_full_couplings,
+    with_wider_bounds,
+    with_wrong_fixed_freed,
+    without_contradicting,
+)
 from .cross_validation import can_cross_validate, cross_validate
 from .data_corrections import corrected_capture, with_corrected_readings, with_prior_of_few
 from .hold_out import held_out_poses, tested, without_held_out
@@ -93,8 +99,9 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         remove_contradicting: leave out groups that contradict all others.
         automatic: give too few data the prior and the noise of a real arm, correct readings that do not match the arm
             where one order, signs, zeros or unit explain them, find joints that move with others, widen default bounds
-            that the fit reaches, leave out what contradicts the rest, and compare models of the joints unless a model,
-            a prior, a method or a robust loss is stated. ``decisions`` of the record says what was done and why.
+            that the fit reaches, free parameters whose fixed value the data contradict, leave out what contradicts the
+            rest, and compare models of the joints unless a model, a prior, a method or a robust loss is stated.
+            ``decisions`` of the record says what was done and why.
         max_steps: most evaluations of each solve.
         stage: called with what is done next, in words, and a function that does it, such as to show progress.
 
@@ -152,6 +159,8 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
             record, explanation = chosen.stage("Checking readings", check)
             capture = capture if explanation is None else corrected_capture(capture, explanation) or capture
             record = chosen.stage("Checking bounds", lambda: with_wider_bounds(record, solved, recorded))
+            freed = lambda: with_wrong_fixed_freed(record, solved, recorded)  # noqa: E731
+            record = chosen.stage("Checking fixed parameters", freed)
         if chosen.remove_contradicting or (automatic and chosen.robust is None):  # which bad poses do not move
             record = chosen.stage("Comparing groups", lambda: without_contradicting(record, solved, recorded))
         if automatic and not stated:
