@@ -49,16 +49,16 @@ _MOST_NAMED, _LEAST_SHARE = 4, 0.3  # of the parameters that do, and of the larg
 class Removed(NamedTuple):
     """What a calibration left out because it contradicts the rest, why, and what that changed."""
 
-    kind: str  # "socket", "placement", "station", ...
-    group: str
-    members: tuple[str, ...]  # names of its sockets and observations
+    kind: str  # "socket", "placement", "station", ..., or "pose"
+    group: str  # its name; of poses with what was probably done wrong
+    members: tuple[str, ...]  # names of its sockets and observations, or of poses
     ratio: float  # F: mean square that it added, over that of the rest
     degrees_of_freedom: tuple[int, int]
     probability: float  # of this ratio or a larger one, where nothing is wrong
     rms_with: float  # root mean square distance of the rest from its geometry, mm
-    rms_without: float  # the same without the group
-    changed_most: str  # parameter
-    change: float  # of it, in standard uncertainties before
+    rms_without: float = 0.0  # the same without the group
+    changed_most: str = ""  # parameter
+    change: float = 0.0  # of it, in standard uncertainties before
 
 
 class CalibrationRecord(NamedTuple):

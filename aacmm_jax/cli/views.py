@@ -121,6 +121,8 @@ def calibration(summary: dict[str, Any]) -> View:
     yield solve(summary)
     if summary.get("lengths_tested"):
         yield words.lengths_sentence(summary["lengths_tested"])
+    if "held_out_poses" in summary:
+        yield words.held_out_sentence(summary["held_out_poses"]["held_out"])
     yield from (f"Decided by default: {decision}" for decision in summary["decisions"])
     if summary["masses"]:
         yield summary["masses"]

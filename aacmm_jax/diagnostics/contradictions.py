@@ -1,7 +1,7 @@
 """Inconsistent groups of a calibration (sockets, stations, placements, sessions), and recalibration without them."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,7 @@ from .equations import EXACT, PROBE, Block, Equations, GroupTest, Rows, contradi
 from .findings import Case, Finding, case_of, chance_text
 
 ORDER, NEEDS = 30, "scale"
+POSE, POSES = "pose", "poses"  # kinds of what was left out
 LEFT_OUT = "left-out"  # code of the finding on a group that the calibration left out
 # Mean square that a group adds over that of the others: errors outside the D-H model make it 7 on real arms, and it
 # is 1 where there are none.
@@ -67,11 +68,15 @@ def test(case: Case) -> list[Finding]:
 def removal(removed: Removed) -> Finding:
     """A group that the calibration left out."""
     first, second = removed.degrees_of_freedom
+    these = "these poses" if removed.kind == POSES else f"this {removed.kind}"
+    subject, contradict = f"{removed.kind} {removed.group}", "contradicts"
+    if removed.kind in (POSE, POSES):
+        subject, contradict = removed.group, "contradict" if removed.kind == POSES else "contradicts"
     return Finding(
         LEFT_OUT,
-        f"Left out: {removed.kind} {removed.group}, which contradicts the other data (F = {removed.ratio:.3g} with "
+        f"Left out: {subject}, which {contradict} the other data (F = {removed.ratio:.3g} with "
         f"{first} and {second} degrees of freedom, {chance_text(removed.probability)}).",
-        f"Without this {removed.kind}, the other poses are {removed.rms_without:.3g} mm RMS from their geometry "
+        f"Without {these}, the other poses are {removed.rms_without:.3g} mm RMS from their geometry "
         f"instead of {removed.rms_with:.3g} mm. The parameter that changed most is {removed.changed_most}, by "
         f"{removed.change:.2g} standard uncertainties.",
         probability=removed.probability,
@@ -330,10 +335,6 @@ def remove_contradicting(
             break
         if not isinstance(again, CalibrationRecord):
             again = record_of(again, record.recording._replace(capture=rest), robust=record.robust)
-        changed = np.abs(again.vectors()["calibrated"] - record.vectors()["calibrated"])
-        u = np.sqrt(np.diag(record.covariance))
-        changes = np.where(u > 0, changed / np.where(u > 0, u, 1.0), 0.0)
-        worst, rows = int(np.argmax(changes)), case_of(again).equations.rows
         removed = Removed(
             kind=clear[0].kind,
             group=suspect.group,
@@ -342,9 +343,17 @@ def remove_contradicting(
             degrees_of_freedom=suspect.test.degrees_of_freedom,
             probability=suspect.test.probability,
             rms_with=suspect.rms_others[0],
-            rms_without=rms_of(rows, np.zeros(rows[0].shared.shape[2])),
-            changed_most=again.names[worst],
-            change=float(changes[worst]),
         )
-        record = again._replace(removed=(*record.removed, removed))
+        record = with_removed(record, again, [removed])
     return record
+
+
+def with_removed(record: CalibrationRecord, again: CalibrationRecord, removed: Sequence[Removed]) -> CalibrationRecord:
+    """The calibration without what was left out of another one, and what that changed."""
+    changed = np.abs(again.vectors()["calibrated"] - record.vectors()["calibrated"])
+    u = np.sqrt(np.diag(record.covariance))
+    changes = np.where(u > 0, changed / np.where(u > 0, u, 1.0), 0.0)
+    worst, rows = int(np.argmax(changes)), case_of(again).equations.rows
+    after: dict[str, Any] = {"rms_without": rms_of(rows, np.zeros(rows[0].shared.shape[2]))}
+    after |= {"changed_most": again.names[worst], "change": float(changes[worst])}
+    return again._replace(removed=(*record.removed, *(part._replace(**after) for part in removed)))

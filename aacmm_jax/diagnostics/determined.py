@@ -15,8 +15,9 @@ from ..uncertainty.identifiability import Observability, observability, rms_of_n
 from .culprits import selection
 from .equations import Block
 from .findings import Case, Finding, by_equations
+from .mistakes import TRY_ALL, mistake_in_data
 from .residual_tests import Candidates, Residuals
-from .usability import TRY_ALL, is_anchored, many_on_bounds, mistake_in_data, on_bounds
+from .usability import is_anchored, many_on_bounds, on_bounds
 
 ORDER, NEEDS = 85, "fit"
 _TOGETHER = 1e-3  # part of an undetermined direction, from which a parameter belongs to it
@@ -90,14 +91,15 @@ def test(case: Case) -> list[Finding]:
 
 def _many(case: Case, sides: dict[str, str]) -> Finding:
     """So many parameters that the data determine are on a bound that the arm is not that of the data."""
+    mistake, widen = case.once(mistake_in_data), "Widen the bounds (--length-bound-mm, --angle-bound-deg)."
     return Finding(
         "many-on-bounds",
         f"{len(sides)} of {len(case.record.names)} parameters are on a bound, so either the bounds are too narrow, or "
         "the data do not match the arm.",
-        advice=case.once(mistake_in_data) or f"Widen the bounds (--length-bound-mm, --angle-bound-deg). {TRY_ALL}",
+        advice=f"{widen} {TRY_ALL}" if mistake is None else mistake.says,
         severity="doubt",
         doubt=f"on a bound: {shorten(sorted(sides), 3)}",
-        concerns=tuple(sides),
+        concerns=tuple(sides) if mistake is None else mistake.concerns,
     )
 
 

@@ -58,8 +58,8 @@ def steps(
             term = MissingTerm("slipped zero", joint, later, follows=follows, concerns=concerns, first=first)
             terms.append(term._replace(cause="a zero offset that slips"))
         for kind, columns, follows, cause in (
-            ("moved base", np.eye(3)[None], "a step of the tip, as if base, artefact or instrument had moved,", _BASE),
-            ("moved probe", turned, "a step of the probe in the last frame, as if it had moved,", _PROBE),
+            ("moved base", np.eye(3)[None], "a displacement of the base, artefact or instrument", _BASE),
+            ("moved probe", turned, "a displacement of the probe on the arm", _PROBE),
         ):
             columns = later[:, :, None] * columns
             terms.append(MissingTerm(kind, None, columns, follows=f"{follows} {after}", cause=cause, first=first))
@@ -88,7 +88,7 @@ def shifted_seats(capture: Capture, near: MissingTerm | None = None) -> list[Mis
             continue
         for first in np.unique(np.linspace(_FEWEST_OF_GROUP, last, number).astype(int)):
             later = np.isin(np.arange(len(labels)), poses[first:]).astype(float)
-            follows = f"a step of {place}, as if it had moved, from {names[poses[first]]} on"
+            follows = f"a displacement of {place} from {names[poses[first]]} on"
             term = MissingTerm("shifted seat", None, later[:, None, None] * np.eye(3), follows=follows)
             term = term._replace(first=int(poses[first]))
             cause = "a seat or artefact that shifts"

@@ -8,26 +8,19 @@ import numpy as np
 
 from ..calibration.record import SCALE_REFUSED, CalibrationRecord
 from ..calibration.results import active_names
-from ..core.errors import InputError
 from ..core.text import shorten
-from ..data.capture import draw_poses
 from ..kinematics.parameters import Parameters
-from .capture_check import check_capture
 from .contradictions import session_metrics
 from .culprits import missing
 from .equations import EXACT
 from .findings import Case, Finding, findings_of
+from .mistakes import mistake_in_data
 from .noisy_encoders import noisiest_joint
 from .pose_residuals import distances_of
-from .reading_check import coupling_words, explanation_words
-from .recorded import likely_cause
 from .residual_tests import SURE
 
 ORDER, NEEDS = 10, "nothing"
 _APART = 5.0  # RMS of a session among others, over that which it has alone, beyond which they are not of one arm
-TRY_ALL = "aacmm arm ARM --check MANIFEST tries every order and sign of the columns, and zero offsets of the joints."
-_CHECKED = 150  # poses, drawn at random: more only take longer
-_BETTER = 2.0  # the factor by which other readings must reduce the residual to be believed
 _MOST, _FEW = 0.5, 0.05  # part of the squared residuals that a few poses have, where they are the reason
 
 
@@ -57,34 +50,19 @@ def _of_residuals(case: Case) -> Finding:
         "implausible-residuals", f"{subject}, but {limit} for this arm.", severity="unusable", concerns=names
     )
     if mistake := case.once(mistake_in_data):
-        says = f"{subject}, but {limit} for this arm, so the data do not match the arm."
-        advice = f"Check the columns, units, signs, sockets and the arm. {mistake}"
-        return finding._replace(says=says, advice=advice, doubt="the data do not match the arm")
+        check = "Check the columns, units, signs, sockets and the arm. " if mistake.of_readings else ""
+        # It stands before the solve that did not end, since it is the reason.
+        finding = finding._replace(advice=f"{check}{mistake.says}", concerns=mistake.concerns or names, explains=1.0)
+        if record.implausible_residual or mistake.of_readings:
+            says = f"{subject}, but {limit} for this arm, so the data do not match the arm."
+            return finding._replace(says=says, doubt="the data do not match the arm")
+        doubt = f"large residuals, most likely {mistake.says.removeprefix('Likely cause: ').rstrip('.')}"
+        return finding._replace(code="large-residuals", severity="doubt", doubt=doubt)
     reason = case.once(likely_reason)
     finding = finding._replace(advice=f"Most likely: {reason}.")
     if record.implausible_residual:
         return finding._replace(doubt=f"residuals are too large for this arm; most likely {reason}")
     return finding._replace(code="large-residuals", severity="doubt", doubt=f"large residuals, most likely {reason}")
-
-
-def mistake_in_data(case: Case) -> str:
-    """A mistake in what was recorded that explains residuals far better than the data as they are; else nothing."""
-    recording = case.record.recording
-    arm, capture = recording.nominal.arm, recording.capture
-    if cause := likely_cause(arm, capture):
-        return cause
-    if len(capture.readings) > _CHECKED:
-        capture = draw_poses(capture, _CHECKED)
-    try:
-        check = check_capture(arm, capture)
-    except InputError:  # neither two poses in a socket nor measured points
-        return ""
-    if check.couplings:
-        return f"Likely cause: {coupling_words(check.couplings)}. {TRY_ALL}"
-    given, best = check.given.rms_fitted, check.best.rms_fitted
-    if not check.explained or check.best == check.given or best * _BETTER > given:
-        return ""
-    return f"Likely cause: {explanation_words(check.best)}. {TRY_ALL}"
 
 
 def likely_reason(case: Case) -> str:

@@ -10,24 +10,27 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.record import CalibrationRecord
+from ..calibration.record import CalibrationRecord, Removed
 from ..calibration.results import Calibration, Identification
 from ..core.distributions import f_tail
 from ..core.errors import InputError
 from ..core.text import shorten
 from ..core.units import DEG
-from ..data.capture import Capture
+from ..data.capture import Capture, part_of
 from ..data.recording import Recording
 from ..diagnostics.capture_check import search_couplings
 from ..diagnostics.causes import term_text
-from ..diagnostics.contradictions import remove_contradicting
+from ..diagnostics.contradictions import POSE, POSES, remove_contradicting, with_removed
 from ..diagnostics.culprits import culprits_of
 from ..diagnostics.equations import EXACT
 from ..diagnostics.findings import case_of
+from ..diagnostics.misplaced_poses import Misplaced
+from ..diagnostics.mistakes import beyond_bounds, fitted_roughly, misplaced
+from ..diagnostics.pose_residuals import distances_of
 from ..diagnostics.reading_check import coupling_words
 from ..diagnostics.residual_tests import LEVEL
 from ..diagnostics.scale import lengths_of
-from ..diagnostics.usability import on_bounds
+from ..diagnostics.usability import many_on_bounds, on_bounds
 from ..kinematics.arm import correction_names, is_length, value_of, without_corrections
 from ..kinematics.corrected_arm import with_further_corrections
 from ..kinematics.corrections import all_sought
@@ -41,11 +44,14 @@ Record = Callable[[Calibration | Identification, Recording], CalibrationRecord]
 
 _WIDER, _ROUNDS = 5.0, 4  # factor by which bounds that were reached are widened, and how often
 _WIDEST = np.pi / 2  # rad
+_BEYOND = 1.5  # half-width of a bound, over the change of its parameter in a rough fit
 _SIZE = 2.0  # factor within which the size of an arm stays that of the nominal one
 _BY_CHANCE = 0.01  # probability of so much smaller residuals by chance, below which wider bounds are kept
+_BETTER = 2.0  # the factor by which leaving out poses must reduce the residual
 _MOST = 0.5  # part of the excess of the residuals that a cause explains, from which it explains most of them
 _PLAIN = "dh"
 _SOME, _FUNCTIONS = "harmonics=1-6", "functions"
+_NOTICED = 1.03  # times the errors of the arm alone in held-out regions, from which a model is not taken
 _WORTH = 10.0  # log evidence that a richer model must add for a still richer one to be tried
 
 
@@ -84,11 +90,18 @@ def with_wider_bounds(record: CalibrationRecord, solve: Solve, recorded: Record)
     if not first or "bounds" in nominal.stated:
         return record
     best, wider = record, record
+    # What a robust fit within far wider bounds shows to be needed, where residuals are large.
+    fit = None if matches(record) else case_of(record).once(fitted_roughly)
+    needed = {} if fit is None else beyond_bounds(fit, nominal)
     for _ in range(_ROUNDS):
         reached = {*on_bounds(wider), *on_bounds(wider, final=True)}
         if not reached:
             break
-        recording = wider.recording._replace(nominal=_widened(wider, reached))
+        widths = {name: _WIDER * _half_width(wider.recording.nominal, name) for name in reached}
+        if needed:
+            widths, needed = {name: _BEYOND * abs(change) for name, change in needed.items()}, {}
+            reached = set(widths)
+        recording = wider.recording._replace(nominal=_widened(wider.recording.nominal, widths))
         try:
             result = solve(recording)
         except InputError:  # with such bounds the data do not determine the arm
@@ -119,9 +132,7 @@ def _half_width(nominal: ArmSpecification, name: str) -> float:
     return nominal.override.get(name, nominal.length if is_length(name) else nominal.angle)
 
 
-def _widened(record: CalibrationRecord, reached: set[str]) -> ArmSpecification:
-    nominal = record.recording.nominal
-    widths = {name: _WIDER * _half_width(nominal, name) for name in reached}
+def _widened(nominal: ArmSpecification, widths: dict[str, float]) -> ArmSpecification:
     widths = {name: width if is_length(name) else min(width, _WIDEST) for name, width in widths.items()}
     return nominal._replace(override={**nominal.override, **widths})
 
@@ -164,6 +175,48 @@ def with_wrong_fixed_freed(record: CalibrationRecord, solve: Solve, recorded: Re
     return again._replace(decisions=(*record.decisions, says))
 
 
+def without_misplaced(record: CalibrationRecord, solve: Solve, recorded: Record) -> CalibrationRecord:
+    """The calibration without the poses that are wrong where most others agree with an arm (`misplaced_poses`), which
+    were recorded under a wrong name, with the readings of another pose, or with a reading that is far off."""
+    wrong = [] if matches(record) else case_of(record).once(misplaced)
+    if not wrong:
+        return record
+    capture, numbers = record.recording.capture, [pose for mistake in wrong for pose in mistake.poses]
+    kept = np.isin(np.arange(len(capture.readings)), numbers, invert=True)
+    ends = np.cumsum([part.q.shape[0] for part in capture.parts])[:-1]
+    rows = {part.name: np.flatnonzero(of) for part, of in zip(capture.parts, np.split(kept, ends), strict=True)}
+    part = record.recording._replace(capture=part_of(capture, [name for name in rows if len(rows[name])], rows))
+    try:
+        again = recorded(solve(part), part)
+    except InputError:  # the rest does not determine the arm
+        return record
+    if not again.converged or again.residual > min(record.residual / _BETTER, again.largest_plausible_residual):
+        return record
+    distances = np.concatenate(distances_of(capture, record.evaluations()["calibrated"]))
+    left_out = [_removed(mistake, again, float(np.sqrt(np.mean(distances[kept] ** 2)))) for mistake in wrong]
+    return with_removed(record, again, left_out)._replace(decisions=record.decisions)
+
+
+def matches(record: CalibrationRecord) -> bool:
+    """Whether data and arm belong together, as far as a solve within its bounds shows it."""
+    return record.converged and record.residual <= record.largest_usual_residual and not many_on_bounds(record)
+
+
+def _removed(mistake: Misplaced, again: CalibrationRecord, rms: float) -> Removed:
+    """Poses that were left out, with the F test of their distances."""
+    count, freedom = 3 * len(mistake.poses), max(int(again.degrees_of_freedom), 1)
+    ratio = (mistake.distance / max(again.residual, 1e-300)) ** 2
+    return Removed(
+        kind=POSE if len(mistake.poses) == 1 else POSES,
+        group=f"{shorten(mistake.names, 3)} ({mistake.says})",
+        members=mistake.concerns,
+        ratio=ratio,
+        degrees_of_freedom=(count, freedom),
+        probability=f_tail(ratio, count, freedom),
+        rms_with=rms,
+    )
+
+
 def without_contradicting(record: CalibrationRecord, solve: Solve, recorded: Record) -> CalibrationRecord:
     """The calibration without groups that contradict all others, where the data show which groups these are."""
 
@@ -179,8 +232,7 @@ def with_best_model(record: CalibrationRecord, solve: Solve, recorded: Record, o
     """The calibration with the model of the joints that predicts held-out regions best; as it is where that is the arm
     alone, where there are too few poses to hold some out, or where a wrong certified value explains most of the
     residuals: a model would only describe what that does to the arm."""
-    recording = record.recording
-    nominal, capture = recording.nominal, recording.capture
+    recording, nominal = record.recording, record.recording.nominal
     if record.observed.rms < EXACT:  # simulated without noise
         return record
     case = case_of(record)
@@ -189,12 +241,40 @@ def with_best_model(record: CalibrationRecord, solve: Solve, recorded: Record, o
         return record
     if not causes and lengths is not None and lengths.odd and lengths.probability < LEVEL:
         return record
-    bounds = nominal.bounds()
+    ladder = _ladder(recording, options)
+    if ladder is None:
+        return record
+    chosen, plain = ladder.recommended, ladder.models[0]
+    if chosen.model == _PLAIN or plain.model != _PLAIN or not chosen.result.converged:
+        return record
+    # Few regions cannot tell such a model from the best, but whoever asked for none would be served worse.
+    if chosen.rms_outside > _NOTICED * plain.rms_outside:
+        return record
+    better = chosen.rms_outside < plain.rms_outside
+    found = [cause.term for cause in causes if cause.kind == "term" and cause.term is not None]
+    terms = [term_text(term) for term in found if term.kind in all_sought() or term.term.correction is not None]
+    follow = f" Without it, residuals follow {shorten(terms, 3)}." if terms else ""
+    says = (
+        f"Model of the joints: {chosen.model}.{follow} In held-out regions its errors are {chosen.rms_outside:.3g} mm "
+        f"RMS, those of Denavit-Hartenberg parameters alone {plain.rms_outside:.3g} mm ({len(ladder.models)} models "
+        f"compared, {len(chosen.regions)} regions)."
+        + ("" if better else " As these hardly differ, the model that makes the measurements more probable was taken.")
+    )
+    corrected = chosen.result.space.base
+    modelled = recording._replace(nominal=nominal._replace(arm=corrected, prior=default_prior(corrected)))
+    again = recorded(chosen.result if options.shared_errors else solve(modelled), modelled)
+    return again._replace(removed=record.removed, decisions=(*record.decisions, says))
+
+
+def _ladder(recording: Recording, options: Any) -> ComparedModels | None:
+    """The default models as far as the data can carry them; None where there are too few poses to hold some out."""
+    nominal, capture, bounds = recording.nominal, recording.capture, recording.nominal.bounds()
 
     def compared(models: list[str]) -> ComparedModels:
         return compare_models(nominal.arm, capture, bounds, models=models, noise=options.noise)
 
     models = [model for model in default_models(nominal.arm, capture) if _FUNCTIONS not in model]
+    ladder: ComparedModels | None = None
     try:
         ladder = options.stage("Comparing models", lambda: compared(models))
         # Models with more functions of each joint take longer, and the next is tried only where the last explains more.
@@ -202,26 +282,12 @@ def with_best_model(record: CalibrationRecord, solve: Solve, recorded: Record, o
             before = max(ladder.models, key=lambda model: model.log_evidence)
             richer = _with_functions(before.model, functions)
             added = options.stage(f"Comparing models ({richer})", lambda model=richer: compared([model]))
-            ladder = ComparedModels((*ladder.models, *added.models))
+            ladder = ladder._replace(models=(*ladder.models, *added.models))
             if added.models[0].log_evidence < before.log_evidence + _WORTH:
                 break
     except (InputError, np.linalg.LinAlgError):  # too few poses to hold some out, or to fit that many functions
-        return record
-    chosen, plain = ladder.recommended, ladder.models[0]
-    if chosen.model == _PLAIN or not chosen.result.converged:
-        return record
-    found = [cause.term for cause in causes if cause.kind == "term" and cause.term is not None]
-    terms = [term_text(term) for term in found if term.kind in all_sought() or term.term.correction is not None]
-    follow = f" Without it, residuals follow {shorten(terms, 3)}." if terms else ""
-    says = (
-        f"Model of the joints: {chosen.model}.{follow} It predicts held-out regions to {chosen.rms_outside:.3g} mm "
-        f"RMS, where Denavit-Hartenberg parameters alone predict them to {plain.rms_outside:.3g} mm "
-        f"({len(ladder.models)} models compared, {len(chosen.regions)} regions)."
-    )
-    corrected = chosen.result.space.base
-    modelled = recording._replace(nominal=nominal._replace(arm=corrected, prior=default_prior(corrected)))
-    again = recorded(chosen.result if options.shared_errors else solve(modelled), modelled)
-    return again._replace(removed=record.removed, decisions=(*record.decisions, says))
+        pass
+    return ladder
 
 
 def _with_functions(model: str, functions: str) -> str:

@@ -17,15 +17,20 @@ from ..data.capture import join_sessions
 from ..data.noise import Noise
 from ..data.recording import Recording
 from ..diagnostics.findings import case_of
+from ..diagnostics.mistakes import mistake_in_data, single_mistake
+from ..diagnostics.reading_fit import Explanation
 from ..kinematics.corrected_arm import with_corrections
 from ..kinematics.priors import Prior, default_prior
 from ..model.loss_names import LossName
 from .automatic import (
+    Record,
+    matches,
     with_best_model,
     with_full_couplings,
     with_wider_bounds,
     with_wrong_fixed_freed,
     without_contradicting,
+    without_misplaced,
 )
 from .cross_validation import can_cross_validate, cross_validate
 from .data_corrections import corrected_capture, with_corrected_readings, with_prior_of_few
@@ -97,11 +102,11 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         monte_carlo: check the uncertainties by Monte Carlo.
         strict: raise `InputError` where such data could not determine free parameters even without noise.
         remove_contradicting: leave out groups that contradict all others.
-        automatic: give too few data the prior and the noise of a real arm, correct readings that do not match the arm
-            where one order, signs, zeros or unit explain them, find joints that move with others, widen default bounds
-            that the fit reaches, free parameters whose fixed value the data contradict, leave out what contradicts the
-            rest, and compare models of the joints unless a model, a prior, a method or a robust loss is stated.
-            ``decisions`` of the record says what was done and why.
+        automatic: give too few data the prior and the noise of a real arm, leave out poses that were mixed up, correct
+            readings that do not match the arm where one order, signs, zeros or unit explain them, find joints that move
+            with others, widen default bounds that the fit reaches, free parameters whose fixed value the data
+            contradict, leave out what contradicts the rest, and compare models of the joints unless a model, a prior,
+            a method or a robust loss is stated. ``decisions`` of the record says what was done and why.
         max_steps: most evaluations of each solve.
         stage: called with what is done next, in words, and a function that does it, such as to show progress.
 
@@ -152,19 +157,20 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         record = chosen.stage("Calibrating", lambda: recorded(solved(recording), recording))
         record = record._replace(decisions=decided)
         if automatic:
-            # First, as a search of seconds; that of orders, signs and zeros takes ten times as long.
             further = chosen.model is None and nominal.arm.corrections is None
-            record = chosen.stage("Checking couplings", lambda: with_full_couplings(record, solved, recorded, further))
-            check = lambda: with_corrected_readings(record, solved, recorded)  # noqa: E731
-            record, explanation = chosen.stage("Checking readings", check)
+            record, explanation = _with_corrected_data(record, chosen, recorded, further)
             capture = capture if explanation is None else corrected_capture(capture, explanation) or capture
-            record = chosen.stage("Checking bounds", lambda: with_wider_bounds(record, solved, recorded))
-            freed = lambda: with_wrong_fixed_freed(record, solved, recorded)  # noqa: E731
-            record = chosen.stage("Checking fixed parameters", freed)
-        if chosen.remove_contradicting or (automatic and chosen.robust is None):  # which bad poses do not move
-            record = chosen.stage("Comparing groups", lambda: without_contradicting(record, solved, recorded))
-        if automatic and not stated:
-            record = with_best_model(record, solved, recorded, chosen)
+        # Where a mistake in the recording remains, every other remedy would only make up for it.
+        mistake = None if not automatic or matches(record) else case_of(record).once(mistake_in_data)
+        if mistake is None or mistake.of_bounds:
+            if automatic:
+                record = chosen.stage("Checking bounds", lambda: with_wider_bounds(record, solved, recorded))
+                freed = lambda: with_wrong_fixed_freed(record, solved, recorded)  # noqa: E731
+                record = chosen.stage("Checking fixed parameters", freed)
+            if chosen.remove_contradicting or (automatic and chosen.robust is None):  # which bad poses do not move
+                record = chosen.stage("Comparing groups", lambda: without_contradicting(record, solved, recorded))
+            if automatic and not stated:
+                record = with_best_model(record, solved, recorded, chosen)
         if masks:
             record = chosen.stage("Testing held-out poses", lambda: tested(record, capture, masks))
         if _to_cross_validate(record, chosen):
@@ -178,6 +184,22 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
             sampled = chosen.stage("Drawing trials", lambda: monte_carlo(result, record.recording.capture))
             record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
     return record
+
+
+def _with_corrected_data(
+    record: CalibrationRecord, chosen: CaptureOptions, recorded: Record, further: bool
+) -> tuple[CalibrationRecord, Explanation | None]:
+    """The calibration without poses that were mixed up, with couplings, and with the readings corrected, where the data
+    do not match the arm; and how they were corrected. ``further``: whether couplings may be added to the model."""
+    solved = partial(_solved, chosen)
+    record = chosen.stage("Checking poses", lambda: without_misplaced(record, solved, recorded))
+    mistake = None if matches(record) else case_of(record).once(single_mistake)
+    if mistake is None:
+        coupled = chosen.stage("Checking couplings", lambda: with_full_couplings(record, solved, recorded, further))
+        return chosen.stage("Checking readings", lambda: with_corrected_readings(coupled, solved, recorded))
+    if mistake.of_readings:  # a search of seconds
+        return chosen.stage("Checking readings", lambda: with_corrected_readings(record, solved, recorded))
+    return record, None
 
 
 def _solving(chosen: CaptureOptions, prior: Prior | None) -> CalibrationOptions:

@@ -15,11 +15,12 @@ from ..core.units import DEG, length_unit
 from ..data.capture import Capture
 from ..data.noise import CLASSES, ArmNoise, class_noise
 from ..data.observations.measured import MeasuredPoints
-from ..data.observations.observation import AbstractObservation
+from ..data.observations.observation import AbstractObservation, stated_u
 from ..data.recording import Recording
 from ..diagnostics.capture_check import check_capture, fits_as_recorded
 from ..diagnostics.reading_check import explanation_words
 from ..diagnostics.reading_fit import Explanation
+from ..diagnostics.recorded import LARGEST_U, SMALLEST_U
 from ..diagnostics.usability import many_on_bounds
 from ..kinematics.arm import Arm
 from ..kinematics.priors import default_prior
@@ -159,8 +160,11 @@ def corrected_capture(capture: Capture, explanation: Explanation) -> Capture | N
         if factor == 1:
             return part.changed(q=readings(part.q))
         assert isinstance(part, MeasuredPoints)
-        points, covariance = factor * np.asarray(part.points), factor**2 * np.asarray(part.covariance)
-        return part.changed(q=readings(part.q), points=points, covariance=covariance)
+        # A u is in mm, whatever the unit of the points, unless it cannot be.
+        u = stated_u(part)
+        of_u = 1.0 if len(u) and u.min() >= SMALLEST_U and u.max() <= LARGEST_U else factor
+        covariance = of_u**2 * np.asarray(part.covariance)
+        return part.changed(q=readings(part.q), points=factor * np.asarray(part.points), covariance=covariance)
 
     parts = tuple(changed(part) for part in capture.observations)
     return eqx.tree_at(lambda c: (c.q, c.observations), capture, (readings(capture.q), parts))

@@ -94,6 +94,7 @@ class ComparedModels(NamedTuple):
     """
 
     models: tuple[ComparedModel, ...]
+    skipped: tuple[str, ...] = ()  # models that the data cannot carry: with more unknowns than equations, for example
 
     @property
     def best(self) -> int:
@@ -177,10 +178,11 @@ def compare_models(
         gravity: Direction of gravity in the base frame ``(3,)``.
 
     Returns:
-        The errors of each model, and the recommended one with its calibration.
+        The errors of each model that the data can carry, and the recommended one with its calibration.
 
     Raises:
-        InputError: A model is unknown, fewer than two regions can be left out, or as `calibrate` does.
+        InputError: A model is unknown, fewer than two regions can be left out, or, where the data can carry none of the
+            models, as `calibrate` does.
 
     Example:
         >>> compared = aj.compare_models(arm, two_bars, bounds, models=["dh", "harmonics=1"])
@@ -203,9 +205,8 @@ def compare_models(
     left_out = regions_of(to_numpy(capture), regions, arm.joints)
     loads: dict[str, Any] = {"mass": mass, "centre": centre, "gravity": gravity}
 
-    def compared(model: str) -> ComparedModel:
+    def compared(model: str, modelled: Arm) -> ComparedModel:
         begun = time.process_time()
-        modelled = with_couplings_of(arm, with_corrections(plain, model, **loads))
         widened = with_coefficients(bounds, modelled)
         corrected, prior = widened.space.base, default_prior(widened.space.base)
         result = calibrate(
@@ -230,7 +231,16 @@ def compare_models(
             log_evidence=log_evidence(equations, record.prior, {group: float(sd) for group, sd in prior.sd.items()}),
         )
 
-    return ComparedModels(tuple(compared(model) for model in named))
+    modelled = [with_couplings_of(arm, with_corrections(plain, model, **loads)) for model in named]
+    found, skipped = [], {}
+    for model, of_model in zip(named, modelled, strict=True):
+        try:
+            found.append(compared(model, of_model))
+        except InputError as error:
+            skipped[model] = str(error)
+    if not found:
+        raise InputError(skipped[named[0]])
+    return ComparedModels(tuple(found), tuple(skipped))
 
 
 def log_evidence(equations: Equations, prior: PriorMetrics, expected: Mapping[str, float]) -> float:

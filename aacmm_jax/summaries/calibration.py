@@ -221,7 +221,9 @@ def calibration_summary(record: CalibrationRecord, volume: VolumetricUncertainty
             summary["truth"][stage] = truth
     held_out = summary["cross_validation"]
     summary["lengths_tested"] = checked_lengths(summary["lengths"], held_out, record.fixed_by_one_length)
-    verdict = calibration_verdict(findings, summary["uncertainty"], held_out, "truth" in summary)
+    verdict = calibration_verdict(
+        findings, summary["uncertainty"], held_out, "truth" in summary, "held_out_poses" in summary
+    )
     return summary | {"verdict": verdict._asdict()}
 
 

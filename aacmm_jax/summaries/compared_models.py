@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from ..core.text import listed as listed_words
 from ..pipeline.model_ladder import ComparedModels
 from .tables import (
     Cell,
@@ -73,6 +74,8 @@ def compared_models_summary(compared: ComparedModels, arm: str) -> dict[str, Any
 def _warnings(compared: ComparedModels) -> list[str]:
     chosen = compared.recommended
     sentences = [f"{model.model} did not converge." for model in compared.models if not model.result.converged]
+    if compared.skipped:
+        sentences.append(f"Not compared, because the data are too few for them: {listed_words(compared.skipped)}.")
     if chosen.ratio >= _EXCESS:
         sentences.append(
             f"With {chosen.model}, errors in held-out regions are {math.sqrt(chosen.ratio):.1f} times as large as the "

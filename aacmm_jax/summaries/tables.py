@@ -295,6 +295,17 @@ def lengths_sentence(row: Mapping[str, Any]) -> str:
     )
 
 
+def held_out_sentence(row: Mapping[str, Any]) -> str:
+    """What poses that a calibration left out say of it (`observations.distances_row`), in words."""
+    if row["rms_mm"] is None:
+        return f"Held out: {pluralise(row['poses'], 'pose')}."
+    predicted = "" if row["rms_predicted_mm"] is None else f", predicted {row['rms_predicted_mm']:.3g} mm"
+    return (
+        f"Held out: {pluralise(row['poses'], 'pose')}; RMS distance from their geometry {row['rms_mm']:.3g} mm"
+        f"{predicted}, largest {row['largest_mm']:.3g} mm."
+    )
+
+
 def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
     """Shared errors in words."""
     words = {PLACES: "all poses of a socket", VISITS: "all poses of a visit"}

@@ -34,10 +34,15 @@ class Verdict(NamedTuple):
 
 
 def calibration_verdict(
-    findings: Sequence[Finding], uncertainty: Mapping[str, Any], held_out: Mapping[str, Any] | None, simulated: bool
+    findings: Sequence[Finding],
+    uncertainty: Mapping[str, Any],
+    held_out: Mapping[str, Any] | None,
+    simulated: bool,
+    single_poses: bool = False,
 ) -> Verdict:
     """Of a calibration: by its findings, the most serious first, and by the uncertainty and the cross-validation of its
-    summary."""
+    summary. ``single_poses`` of groups were held out: they lie among those that were used, so that they confirm little,
+    and a line of their own says what they show."""
     unusable = [finding for finding in findings if finding.severity == "unusable"]
     if unusable:
         says = unusable[0].doubt
@@ -54,7 +59,8 @@ def calibration_verdict(
     agrees = held_out is not None and held_out["rms_mm"] is not None
     checked = "held-out data agree with this U" if agrees else "no held-out data confirm this U"
     prefix = "Calibrated, in simulation" if simulated else "Calibrated"
-    return Verdict("good" if agrees else "neutral", f"{prefix}: {stated}; {checked}.")
+    says = f"{prefix}: {stated}." if single_poses and not agrees else f"{prefix}: {stated}; {checked}."
+    return Verdict("good" if agrees else "neutral", says)
 
 
 def length_uncertainty(uncertainty: Mapping[str, Any]) -> str | None:

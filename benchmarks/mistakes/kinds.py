@@ -92,9 +92,11 @@ def _a_pose(trial: Trial) -> int:
 
 
 def pose_name(trial: Trial, row: int) -> str:
-    """A pose as findings name it: its socket or observation, and its number there."""
-    names = [label.partition("/")[0] for label in trial.label]
-    return f"{names[row]} pose {names[: row + 1].count(names[row])}"
+    """A pose as findings name it: its socket or observation, and its number there, hole after hole."""
+    owner = trial.label[row].partition("/")[0]
+    rows = [i for i, label in enumerate(trial.label) if label.partition("/")[0] == owner]
+    holes = list(dict.fromkeys(trial.label[rows]))
+    return f"{owner} pose {sorted(rows, key=lambda i: holes.index(trial.label[i])).index(row) + 1}"
 
 
 def growth(trial: Trial, size: float) -> None:
@@ -374,7 +376,7 @@ KINDS: dict[str, Kind] = {
         (r"zero of joint {joint}", r"offset[^.]*joint {joint}", r"\[theta_{joint}\]")),
     "degrees for radians": Kind(converted(np.degrees), "", False, (r"degrees|in deg|\bdeg\b|unit of the readings",)),
     "wrong unit of lengths": Kind(length_unit, "", False, (r"\bin (m|cm|metres|inches)\b", r"^implausible-scale")),
-    "left-handed": Kind(left_handed, "", False, (r"left-handed|mirror|exchanged axes",),
+    "left-handed": Kind(left_handed, "", False, (r"left-handed|mirror|exchanged axes|columns of positions are y x z",),
         lambda case: case.kind in ("points", "transforms")),
     "u too small": Kind(stated_u(0.1), "", False, (r"\bu\b[^.]*too small|^lengths-disagree|u and the|their u\b",)),
     "u too large": Kind(stated_u(10.0), "", False, (r"\bu\b[^.]*too large",)),

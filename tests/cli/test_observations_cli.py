@@ -360,6 +360,8 @@ def test_residuals_are_written_pose_by_pose(aacmm, folder, tmp_path):
     summary = found["held_out_poses"]["held_out"]
     assert summary["mean_mm"] == pytest.approx(held_out.mean())
     assert summary["largest_mm"] == pytest.approx(held_out.max())
+    shown = aacmm("show", "c.h5").stdout
+    assert f"Held out: 25 poses; RMS distance from their geometry {summary['rms_mm']:.3g} mm, predicted" in shown
     assert "--residuals" in aacmm("evaluate", "points.toml", "--residuals", "p.csv", expect=2).stderr
 
 

@@ -63,10 +63,10 @@ def from_pose(first, last=80):
         (joint(3, lambda n, q: 20 * ARCSEC * (n >= 47)), "missing-terms", "joint 3", "zero of joint 3 from C pose 8"),
         (joint(3, lambda n, q: 1e-4 * q[:, 0]), "missing-terms", "joint 3", "joint 3 with the reading of joint 1"),
         (load, "missing-terms", "joint 2", "load on joint 2 from"),
-        (moved(from_pose(30, 40), at_base), "missing-terms", "B", "a step of B, as if it had moved, from B pose 11 on"),
+        (moved(from_pose(30, 40), at_base), "missing-terms", "B", "a displacement of B from B pose 11 on"),
         # C and D, which were recorded afterwards, have places of their own, so that this is the same.
-        (moved(from_pose(33), at_base), "missing-terms", "B", "Equally likely: a step of the tip, as if base"),
-        (moved(from_pose(33), of_flange), "missing-terms", "tip", "a step of the probe in the last frame, as if"),
+        (moved(from_pose(33), at_base), "missing-terms", "B", "Equally likely: a displacement of the base"),
+        (moved(from_pose(33), of_flange), "missing-terms", "tip", "a displacement of the probe on the arm"),
     ],
 )
 def test_the_cause_stands_first(paper_arm, capture, errors, code, concerns, words):

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
-from aacmm_jax.diagnostics.recorded import likely_cause
+from aacmm_jax.diagnostics.corrections import likely_cause
 
 BOX = [[200, -300, 100], [600, 300, 500]]
 FRAME = (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0)
@@ -44,7 +44,8 @@ def test_readings_of_sockets(paper_arm, noisy_capture, mistake, cause):
     check(likely_cause(paper_arm, capture), cause)
 
 
-def check(said, cause):
+def check(mistake, cause):
+    said = "" if mistake is None else mistake.says
     assert said.partition(". Correcting")[0] == (f"Likely cause: {cause}" if cause else "")
 
 
@@ -126,7 +127,7 @@ def test_observations(paper_arm, captures, names, field, mistake, cause):
     wrong = eqx.tree_at(concerned, capture, [mistake(np.asarray(values)) for values in concerned(capture)])
     said = likely_cause(paper_arm, wrong)
     check(said, cause)
-    assert (f'write units = {{ {field} = "m" }}.' in said) == cause.startswith(METRES)
+    assert (f'write units = {{ {field} = "m" }}.' in said.says) == cause.startswith(METRES)
 
 
 @pytest.mark.parametrize("names", sorted({row[0] for row in MISTAKES}))

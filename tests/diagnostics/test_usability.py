@@ -61,12 +61,12 @@ def made(readings, changed, stated=None):
     ("changed", "stated", "severity", "reason"),
     [
         (as_read, None, None, ""),
-        (one_pose, None, "unusable", "Most likely: errors of a few poses, the largest in B pose 4."),
+        (one_pose, None, "unusable", "Likely cause: B pose 4: "),
         (one_joint, None, "doubt", "Most likely: play or a loose encoder in joint 4."),
         (wrong_sign, None, "unusable", "Likely cause: joint 4 was read with the wrong sign."),
         (wrong_zero, None, "unusable", "Likely cause: the zero of joint 3 is -45 deg off."),
         (exchanged, None, "unusable", "Most likely: errors in B."),
-        (as_read, 0.05, "doubt", "Most likely: bounds that are too narrow (reached: "),
+        (as_read, 0.05, "doubt", "Likely cause: the arm differs from what is stated in its file by more than"),
     ],
 )
 def test_reasons(readings, changed, stated, severity, reason):

@@ -14,7 +14,7 @@ PACKAGE = ROOT / "aacmm_jax"
 PAGE = (ROOT / "docs" / "warnings.md").read_text(encoding="utf-8")
 # Where warnings are worded: of a module all functions, or those that are named.
 SOURCES: dict[str, tuple[str, ...]] = {
-    "diagnostics/recorded.py": ("likely_cause",),
+    "diagnostics/corrections.py": ("likely_cause",),
     "summaries/arm_survey.py": ("arm_survey",),
     "summaries/compared_models.py": ("_warnings",),
     "summaries/correction.py": ("correction_summary",),

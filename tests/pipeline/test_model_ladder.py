@@ -1,6 +1,7 @@
 """Models of joints compared: predictions of regions against calibrations without them, and which model is found."""
 
 from inspect import unwrap  # calls a function without its run-time types
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from aacmm_jax.data.recording import Recording
 from aacmm_jax.diagnostics.equations import equations_of
 from aacmm_jax.kinematics import with_corrections
 from aacmm_jax.kinematics.parameters import ArmSpecification
+from aacmm_jax.pipeline import automatic
 from aacmm_jax.pipeline.cross_validation import UnseenRegion, _dense, regions_of, unseen_regions
 from aacmm_jax.pipeline.model_ladder import (
     DEFAULT_MODELS,
@@ -23,6 +25,7 @@ from aacmm_jax.pipeline.model_ladder import (
     log_evidence,
 )
 from aacmm_jax.pipeline.single import with_joint_model
+from aacmm_jax.summaries.compared_models import compared_models_summary
 
 NOISE = aj.Noise(encoder_arcsec=10, seating=0.02)
 FRAME = (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0)
@@ -167,6 +170,44 @@ def test_regions_exclude_and_evidence_decides_among_the_others(squares, evidence
 
     models = tuple(model(*of) for of in zip("abc", squares, evidence, strict=True))
     assert ComparedModels(models).recommended.model == expected
+
+
+@pytest.mark.parametrize(("outside", "taken"), [(0.99, True), (1.02, True), (1.05, False)])
+def test_a_model_that_predicts_worse_is_not_taken_by_default(monkeypatch, paper_arm, space, outside, taken):
+    """However probable it makes the measurements: three regions cannot tell it from the arm alone."""
+    recording = Recording(sockets(paper_arm, space), ArmSpecification(paper_arm))
+    record = aj.calibrate_capture(recording, model="dh", automatic=False, cross_validate=False, shared_errors=False)
+    result = SimpleNamespace(converged=True, space=SimpleNamespace(base=record.calibrated.arm))
+
+    def compared(*arguments, models, **options):
+        squares = {
+            "dh": np.ones(3),
+            "gravity": outside**2 + np.array([-0.5, 0.0, 0.5]),
+            "harmonics=1": np.full(3, 0.97),
+        }
+        rows = []
+        for name, values in squares.items():
+            regions = tuple(UnseenRegion("", 10, float(value), 1.0) for value in values)
+            evidence = 50.0 * (name == "gravity")
+            rows.append(ComparedModel(name, 1, 1.0, 0.1, regions, 0.0, result, evidence))
+        return ComparedModels(tuple(row for row in rows if row.model in models or "harmonics=1-6" in models[0]))
+
+    monkeypatch.setattr(automatic, "compare_models", compared)
+    options = SimpleNamespace(noise=None, shared_errors=True, stage=lambda what, work: work())
+    recorded = lambda found, part: record._replace(recording=part)  # noqa: E731
+    chosen = automatic.with_best_model(record, lambda part: result, recorded, options)
+    assert (chosen is not record) == taken
+    assert any("Model of the joints: gravity" in says for says in chosen.decisions) == taken
+
+
+def test_a_model_that_the_data_cannot_carry_is_skipped(paper_arm, space, bounds):
+    capture = sockets(paper_arm, space)
+    compared = compare_models(paper_arm, capture, bounds, models=["dh", "harmonics=1-31"])
+    assert ([model.model for model in compared.models], compared.skipped) == (["dh"], ("harmonics=1-31",))
+    warnings = compared_models_summary(compared, "arm")["warnings"]
+    assert "Not compared, because the data are too few for them: harmonics=1-31." in warnings
+    with pytest.raises(aj.InputError, match="equations"):
+        compare_models(paper_arm, capture, bounds, models=["harmonics=1-31"])
 
 
 def test_the_evidence_is_that_of_a_gaussian(paper_arm, space, bounds):
