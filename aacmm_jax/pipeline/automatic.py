@@ -233,7 +233,7 @@ def with_best_model(record: CalibrationRecord, solve: Solve, recorded: Record, o
     alone, where there are too few poses to hold some out, or where a wrong certified value explains most of the
     residuals: a model would only describe what that does to the arm."""
     recording, nominal = record.recording, record.recording.nominal
-    if record.observed.rms < EXACT:  # simulated without noise
+    if record.observed.rms < EXACT or not record.names:  # simulated without noise, or only geometry was identified
         return record
     case = case_of(record)
     causes, lengths = culprits_of(case), case.once(lengths_of)

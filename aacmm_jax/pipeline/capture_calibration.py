@@ -35,6 +35,7 @@ from .automatic import (
 from .cross_validation import can_cross_validate, cross_validate
 from .data_corrections import corrected_capture, with_corrected_readings, with_prior_of_few
 from .hold_out import held_out_poses, tested, without_held_out
+from .reading_sets import with_other_readings
 from .single import CalibrationOptions, calibrate, identify
 
 _SOLVE = CalibrationOptions()
@@ -192,6 +193,7 @@ def _with_corrected_data(
     """The calibration without poses that were mixed up, with couplings, and with the readings corrected, where the data
     do not match the arm; and how they were corrected. ``further``: whether couplings may be added to the model."""
     solved = partial(_solved, chosen)
+    record = with_other_readings(record, solved)
     record = chosen.stage("Checking poses", lambda: without_misplaced(record, solved, recorded))
     mistake = None if matches(record) else case_of(record).once(single_mistake)
     if mistake is None:
