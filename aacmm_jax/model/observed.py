@@ -26,7 +26,7 @@ from ..solver.arrow import split
 from .layout import Layout, layout_of, unknowns_of
 from .sockets import means_over_sockets
 
-_STEPS = {"mm": 1.0, "rad": 1e-3, "px": 1.0, "1": 1e-3}  # natural steps, as those of the arm's parameters
+_STEPS = {"mm": 1.0, "rad": 1e-3, "px": 1.0, "1": 1.0}  # natural steps, as those of the arm's parameters
 
 
 @pytree

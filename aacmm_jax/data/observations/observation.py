@@ -91,6 +91,9 @@ class AbstractObservation(Declared):
     rotates: ClassVar[bool] = False  # whether the residual depends on the rotation of the last frame
     reduces: ClassVar[bool] = False  # whether it has so many residuals a pose that they are reduced to fewer rows
     stacks: ClassVar[bool] = True  # whether it can be evaluated together with others of the kind: see `alike`
+    # Whether geometry that no other observation uses is eliminated; else it stands beside the arm's parameters, so that
+    # there is something to solve for where no parameter is free.
+    eliminates: ClassVar[bool] = True
     # Whether the residual is linear in all unknowns, with derivatives that do not depend on tips and unknowns.
     linear: ClassVar[bool] = False
     fixes_scale: bool = False  # whether it determines the scale of the arm
