@@ -154,6 +154,32 @@ def observed_record(paper_arm) -> "aj.calibration.CalibrationRecord":
     return aj.calibration.record_of(result, aj.Recording(capture, nominal), robust="tukey")
 
 
+@pytest.fixture(scope="session")
+def camera_records(paper_arm) -> "dict[str, aj.calibration.CalibrationRecord]":
+    """Calibrations of two joints with a camera: a pinhole on the arm, and a fixed fisheye; both with distortion."""
+    from aacmm_jax.data.observations import SimulatedPixels
+
+    points = [(60 * column, 60 * row, 0) for row in range(2) for column in range(3)]
+    on_arm = {"intrinsics": (600, 602, 321, 238, -0.25, 0.08, 0.001, -0.0005), "mount": (60, 0, 20, 0, 0, 0.3)}
+    on_arm |= {"camera": "webcam", "frame": (np.pi, 0, 0, 400, 200, 300)}
+    fixed = {"intrinsics": (330, 330, 320, 240, 0.05, -0.02, 0.004, 0), "mount": (20, 0, 40, 0, 0.2, 0.3)}
+    fixed |= {"camera": 'the "<b>webcam</b>"', "frame": (0, np.pi / 2, 0, -100, 200, 300), "on_arm": False}
+    nominal = aj.kinematics.ArmSpecification(paper_arm, "paper's")
+    bounds = aj.Bounds.around(paper_arm, aj.Parameters(paper_arm, ("theta_2", "theta_3")), angle=0.02)
+    records = {}
+    for name, stated in (("on the arm", on_arm), ("fixed", fixed | {"model": "fisheye"})):
+        webcam = SimulatedPixels("images", 12, board="board", points=points, image_size=(640, 480), **stated)
+        capture = aj.simulate(paper_arm, {}, observations=[webcam], encoder_arcsec=2.0, seed=3)
+        recording = aj.Recording(capture, nominal)
+        records[name] = aj.calibration.record_of(aj.calibrate(paper_arm, capture, bounds), recording)
+    return records
+
+
+@pytest.fixture(params=["on the arm", "fixed"])
+def camera_record(request, camera_records):
+    return camera_records[request.param]
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _few_memory_maps():
     """Forget compiled programs before Linux refuses more memory maps (65,530 a process), which ends in a crash."""

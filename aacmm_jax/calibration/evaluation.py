@@ -7,7 +7,7 @@ of a tip weighs the same, their positions are the means of their tips.
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -168,8 +168,9 @@ def _evaluated(
         squares = observed.by_observation(observed.squared_distances(linear.point.rows))
         by_unit = {unit: [] for unit in OTHER_UNITS}
         for observation, values in zip(observed.observations, residuals, strict=True):
-            for unit, rows in by_unit.items():
-                rows.append(_rms(xp, values[observation.lengths :] if observation.other_unit == unit else values[:0]))
+            for unit, of_unit in by_unit.items():
+                seen = observation.other_unit == unit
+                of_unit.append(xp.sqrt(xp.mean(observation.other_sizes(values) ** 2)) if seen else xp.asarray(np.nan))
         described = ObservedEvaluation(
             names=tuple(observation.name for observation in observed.observations),
             kinds=tuple(observation.kind for observation in observed.observations),
@@ -179,16 +180,16 @@ def _evaluated(
             rms=xp.stack([xp.sqrt(xp.mean(square)) for square in squares]),
             rms_angle=xp.stack(by_unit["rad"]),
             rms_px=xp.stack(by_unit["px"]),
-            reduced_chi=xp.stack([xp.sqrt(xp.mean(white**2)) for white in normalised]),
+            reduced_chi=xp.stack(
+                [
+                    xp.sqrt(xp.sum(white**2) / observation.pose_equations.sum())
+                    for observation, white in zip(observed.observations, normalised, strict=True)
+                ]
+            ),
             sigma=fitted.sigma,
             geometry={name: parts[name] for name in observed.names},
         )
     return Evaluation(metrics, measured, measured - nominal, u, distances, described)
-
-
-def _rms(xp: Any, rows: Float[AnyArray, "r m"]) -> Float[AnyArray, ""]:
-    """Root mean square length of the columns; NaN where they have no rows."""
-    return xp.sqrt(xp.mean(xp.sum(rows**2, axis=0))) if rows.shape[0] else xp.asarray(np.nan)
 
 
 class GeometryFit(NamedTuple):

@@ -177,7 +177,7 @@ def _of_part(
     variances = to_mm @ to_mm.swapaxes(1, 2) + of_arm + of_place + of_kept
     u = np.sqrt(np.maximum(np.einsum("mcc->m", variances), 0.0))
     angle, pixels = (
-        np.linalg.norm(values[observation.lengths :], axis=0) if observation.other_unit == unit else np.full(m, np.nan)
+        observation.other_sizes(values) if observation.other_unit == unit else np.full(m, np.nan)
         for unit in OTHER_UNITS
     )
     alone = observation.kind == "socket" and m == 1 and bool(fitted.all())

@@ -201,7 +201,7 @@ class _Unseen(NamedTuple):
 
 def _part_of(problem: _Unseen, number: int, part: ObservationRows) -> _Part:
     values = np.asarray(part.values)
-    r, m = values.shape
+    m = values.shape[1]
     private, joined = (np.moveaxis(np.asarray(rows[number]), -1, 0) for rows in (problem.private, problem.joined))
     observation, by_tip = part.observation, np.asarray(part.by_tip)
     to_mm = np.moveaxis(np.linalg.inv(np.asarray(part.root)), 0, -1)
@@ -221,9 +221,9 @@ def _part_of(problem: _Unseen, number: int, part: ObservationRows) -> _Part:
         poses=0 if observation.kind == "socket" and m == 1 else m,
         squares=float(np.sum(observation.in_mm(values, by_tip) ** 2)),
         others=m * has_unit,
-        other_squares=np.sum(values[observation.lengths :] ** 2) * has_unit,
+        other_squares=np.sum(observation.other_sizes(values) ** 2) * has_unit,
         normalised=float(np.sum(np.asarray(part.white) ** 2)),
-        rows=r * m,
+        rows=int(observation.pose_equations.sum()),
         trace=math.inf if is_open else float(np.einsum("maa->", weights) + np.sum(weights * errors)),
         square=float(square),
         shared=np.einsum("mwa,mva->wv", joined @ weights, joined),

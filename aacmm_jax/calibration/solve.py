@@ -217,7 +217,7 @@ def _metrics(
     squares = [xp.sum(block.white**2, axis=0) for block in linear.blocks[: len(observed.layout.groups)]]
     pairs = zip(squares, linear.weights, strict=False)
     weights = [xp.ones(square.shape) if weight is None else weight for square, weight in pairs]
-    rows = np.array([observation.rows for observation in observed.observations], dtype=float)
+    rows = np.array([observation.pose_equations.mean() for observation in observed.observations])
     # Whitened rows have variance 1, so the mean of their squares is about 1 where the noise is as the weights say.
     total = sum(xp.sum(square) for square in squares)
     degrees_of_freedom = xp.maximum(xp.asarray(observed.equations - spent, dtype=float), 1.0)

@@ -1,5 +1,11 @@
+from .detection import Detection as Detection
+from .detection import detect as detect
+from .detection import overlay as overlay
 from .names import Charuco as Charuco
 from .names import Checkerboard as Checkerboard
 from .names import PointTable as PointTable
 from .names import TagGrid as TagGrid
 from .names import target_of as target_of
+from .printing import board_pdf as board_pdf
+from .rendering import Optics as Optics
+from .rendering import render as render

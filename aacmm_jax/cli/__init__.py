@@ -21,6 +21,7 @@ _FAMILIES = (
     "controller_commands",
     "study_commands",
     "plan_commands",
+    "target_command",
 )
 
 

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.arguments import OneOf, Range, checked, checked_arguments, checked_fields, shown
+from ..core.arguments import OneOf, Range, checked, checked_arguments, checked_fields, items_of, shown
 from ..core.arrays import Numbers
 from ..core.errors import InputError, nearest
 
@@ -67,8 +67,9 @@ class AbstractTarget:
             raise InputError(
                 f"size of the target '{self.kind}' is {size:g} mm; sizes are in mm, so {size:g} m are {1000 * size:g}."
             )
-        if getattr(self, "dictionary", ""):
-            object.__setattr__(self, "dictionary", dictionary_name(self.dictionary))
+        dictionary = getattr(self, "dictionary", "")
+        if dictionary:
+            object.__setattr__(self, "dictionary", dictionary_name(dictionary))
 
     @property
     def kind(self) -> str:
@@ -291,7 +292,9 @@ class PointTable(AbstractTarget):
     def __post_init__(self) -> None:
         super().__post_init__()
         sizes: dict[str, int] = {}
-        ids = checked(list(self.point_ids), Float[np.ndarray, " points"], "ids of the table of points", sizes)
+        ids = checked(
+            items_of(self.point_ids, "ids"), Float[np.ndarray, " points"], "ids of the table of points", sizes
+        )
         points = checked(self.coordinates, Float[np.ndarray, "points 3"], "the table of points", sizes)
         object.__setattr__(self, "point_ids", ids)
         object.__setattr__(self, "coordinates", points)

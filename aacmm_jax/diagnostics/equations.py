@@ -267,6 +267,7 @@ def equations_of(record: CalibrationRecord) -> Equations:
     common = np.unique(np.concatenate([np.arange(observed.layout.shared), *private]).astype(int))
     rows = []
     for part in linear.parts():
+        part = part.without_rest()
         weight = np.sqrt(np.asarray(part.weight))
         root = weight[:, None, None] * np.asarray(part.root)
         by = np.moveaxis(np.asarray(part.by_head) * weight, (0, 1, 2), (2, 1, 0)) * steps[: linear.height]

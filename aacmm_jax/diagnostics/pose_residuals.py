@@ -48,12 +48,8 @@ def observation_residuals(record: CalibrationRecord) -> tuple[ObservationResidua
             ObservationResiduals(
                 observation=observation,
                 distance=np.linalg.norm(position, axis=0),
-                other={
-                    unit: np.linalg.norm(np.asarray(part.values)[rows], axis=0)
-                    for unit, rows in of_unit.items()
-                    if unit != "mm"
-                },
-                normalised=np.sqrt(np.mean(white**2, axis=0)),
+                other={unit: observation.other_sizes(np.asarray(part.values)) for unit in of_unit if unit != "mm"},
+                normalised=np.sqrt(np.sum(white**2, axis=0) / observation.pose_equations),
                 weight=np.asarray(part.weight),
                 u={unit: float(np.sqrt(np.mean(variances[:, rows]))) for unit, rows in of_unit.items()},
                 by_joint=-np.einsum("rm,rnm->nm", position, moved) / np.maximum(lever, _LEAST_LEVER) ** 2,

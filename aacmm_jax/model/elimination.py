@@ -106,7 +106,7 @@ def weighted(block: RowBlock, weight: Float[AnyArray, " m"] | None) -> RowBlock:
         return block
     root = namespace(weight).sqrt(weight)[None]
     by_head, by_own = (None if by is None else by * root[None] for by in (block.by_head, block.by_own))
-    return RowBlock(block.white * root, by_head, by_own, block.class_index, block.sizes)
+    return RowBlock(block.white * root, by_head, by_own, block.class_index, block.sizes, block.counts)
 
 
 def _curved(block: RowBlock, along: Float[AnyArray, " m"]) -> RowBlock:
@@ -134,7 +134,7 @@ def cost_and_weights(
         if loss is None or number >= groups:
             total, weight = total + 0.5 * namespace(block.white).sum(block.white**2), None
         else:
-            costs, weight = loss.cost_and_weight(block.white)
+            costs, weight = loss.cost_and_weight(block.white, block.counts)
             total = total + namespace(costs).sum(costs)
         weights.append(weight)
     return total, weights
@@ -212,7 +212,8 @@ def _blocks(z: Float[AnyArray, " z"], args: Args) -> list[RowBlock]:
     """The rows at a point; those of components without unknowns are where these fit best."""
     space, observed, whitening, _, linear, batch = args
     whole = z if linear is None else namespace(z, linear).concatenate([z, linear])
-    blocks = row_blocks(space, observed, whole, rows_at(space, observed, whole, batch is not None), whitening)
+    point = rows_at(space, observed, whole, batch is not None, bool(whitening.bases))
+    blocks = row_blocks(space, observed, whole, point, whitening)
     first = len(observed.layout.classes) - args.eliminated
     return [_fitted(block) if block.class_index >= first else block for block in blocks]
 
@@ -226,7 +227,7 @@ def observed_model(z: Float[AnyArray, " z"], args: Args, *, curved: bool = True)
     blocks = [weighted(block, weight) for block, weight in zip(plain, weights, strict=True)]
     if args.loss is not None and curved:
         for number in range(len(layout.groups)):
-            blocks[number] = _curved(blocks[number], args.loss.along(plain[number].white))
+            blocks[number] = _curved(blocks[number], args.loss.along(plain[number].white, plain[number].counts))
     kept = len(layout.classes) - args.eliminated
     arrow, slopes = arrow_of(blocks, layout.classes[:kept], p + layout.shared, prior)
     xp = namespace(arrow)
@@ -249,10 +250,11 @@ def observed_model(z: Float[AnyArray, " z"], args: Args, *, curved: bool = True)
 
 def observed_rows(z: Float[AnyArray, " z"], args: Args) -> tuple[AnyArray, ...]:
     """Whitened residuals of observations, lengths, certified values and the prior: half their squares are minimised."""
-    rows, prior = [block.white for block in _blocks(z, args)], args.whitening.prior
+    blocks, prior = _blocks(z, args), args.whitening.prior
+    rows = [block.white for block in blocks]
     if args.loss is not None:
-        poses = slice(0, len(args.observed.layout.groups))
-        rows[poses] = [args.loss.transformed(white) for white in rows[poses]]
+        for number in range(len(args.observed.layout.groups)):
+            rows[number] = args.loss.transformed(rows[number], blocks[number].counts)
     return tuple(rows) if prior is None else (*rows, prior.residual(z))
 
 

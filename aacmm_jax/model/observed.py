@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from ..core.numpy_or_jax import AnyArray, namespace, pytree, set_at, static, to_numpy
 from ..data.capture import Capture, check_one_capture, check_readings
+from ..data.observations.declared import is_known
 from ..data.observations.held import platform_frames, position_of
 from ..data.observations.observation import AbstractObservation, Rows, Tips, offset_of
 from ..kinematics.arm import Arm
@@ -104,8 +105,15 @@ class Observed:
     @cached_property
     def equations(self) -> int:
         """Number of equations: rows of all poses, reference lengths and certified values."""
-        rows = sum(observation.rows * observation.q.shape[0] for observation in self.observations)
-        return rows + len(self.ends) + sum(len(value) for value, _ in self.certified().values())
+        rows = sum(observation.pose_equations.sum() for observation in self.observations)
+        known = (is_known(u) for _, u in self.certified().values())
+        return int(rows) + len(self.ends) + sum(int(np.sum(mask)) for mask in known)
+
+    @cached_property
+    def arm_equations(self) -> int:
+        """Those of them that show errors of the arm: not what is left of rows that are reduced."""
+        rest = (observation.equations for observation in self.observations)
+        return self.equations - sum(int(counts[-1].sum()) for counts in rest if counts is not None)
 
     def split(self, geometry: Float[AnyArray, " g"]) -> dict[str, Float[AnyArray, " k"]]:
         """The numbers of each part."""

@@ -99,26 +99,35 @@ class Loss(eqx.Module):
 
     name: LossName = eqx.field(static=True)
 
-    def cost_and_weight(self, white: Float[AnyArray, "r m"]) -> tuple[Float[AnyArray, " m"], Float[AnyArray, " m"]]:
-        """Cost and weight of every pose."""
-        xp, c2 = namespace(white), tuning_constant(self.name, white.shape[0]) ** 2
+    def square_of(self, white: Float[AnyArray, "r m"], counts: tuple[int, ...] = ()) -> Any:
+        """c^2: one for all poses, or one each by how many equations each gives."""
+        if not counts:
+            return tuning_constant(self.name, white.shape[0]) ** 2
+        squares = {count: tuning_constant(self.name, count) ** 2 for count in set(counts)}
+        return namespace(white).asarray(np.array([squares[count] for count in counts]))
+
+    def cost_and_weight(
+        self, white: Float[AnyArray, "r m"], counts: tuple[int, ...] = ()
+    ) -> tuple[Float[AnyArray, " m"], Float[AnyArray, " m"]]:
+        """Cost and weight of every pose; ``counts`` are their equations, where these are not the rows."""
+        xp, c2 = namespace(white), self.square_of(white, counts)
         s = xp.sum(white**2, axis=0) / c2
         return 0.5 * c2 * _SHAPES[self.name].rho(xp, s), _SHAPES[self.name].weight(xp, s)
 
-    def along(self, white: Float[AnyArray, "r m"]) -> Float[AnyArray, " m"]:
+    def along(self, white: Float[AnyArray, "r m"], counts: tuple[int, ...] = ()) -> Float[AnyArray, " m"]:
         """Square roots of the ratios q of two curvatures of the cost of every pose: along its residual, and across it.
 
         The second derivative of the cost by the residual r is w (1 + (q - 1) u u^T), with the weight w and the
         direction u of r. Negative curvatures, by which a step would lead uphill, are left out (Triggs et al. 2000,
         4.3). Steps by weights alone (q = 1) converge the more slowly the more poses of a socket are beyond c.
         """
-        xp, c2 = namespace(white), tuning_constant(self.name, white.shape[0]) ** 2
+        xp, c2 = namespace(white), self.square_of(white, counts)
         return xp.sqrt(xp.maximum(_SHAPES[self.name].curvature(xp, xp.sum(white**2, axis=0) / c2), _LEAST_CURVATURE))
 
-    def transformed(self, white: Float[AnyArray, "r m"]) -> Float[AnyArray, "r m"]:
+    def transformed(self, white: Float[AnyArray, "r m"], counts: tuple[int, ...] = ()) -> Float[AnyArray, "r m"]:
         """Residuals whose squares are twice the cost."""
         xp, square = namespace(white), namespace(white).sum(white**2, axis=0)
-        small = square < 1e-12 * tuning_constant(self.name, white.shape[0]) ** 2
-        cost = xp.where(small, 0.5, self.cost_and_weight(white)[0])
+        small = square < 1e-12 * self.square_of(white, counts)
+        cost = xp.where(small, 0.5, self.cost_and_weight(white, counts)[0])
         factor = xp.sqrt(2 * cost / xp.where(small, 1.0, square))
         return xp.where(small, 1.0, factor)[None] * white

@@ -29,6 +29,8 @@ from .layout import Group, Layout
 from .observed import Observed, tips_of
 from .sockets import to_poses
 
+_SMALL = 6  # rows, up to which sums are as fast as a product of matrices
+
 
 class PriorRows(NamedTuple):
     """What is known of the parameters besides the observations: rows weight (x - mean), of standard deviation 1."""
@@ -49,6 +51,9 @@ class Whitening(NamedTuple):
     lengths: Float[AnyArray, " l"]  # one over a standard deviation
     certified: dict[str, Float[AnyArray, " k"]]
     prior: PriorRows | None = None
+    # Of each group, the basis of rows that are reduced: where these are given, a kind's own residuals are reduced after
+    # their weighting.
+    bases: tuple[Float[AnyArray, "_ _ _"] | None, ...] = ()
 
 
 class RowBlock(eqx.Module):
@@ -61,6 +66,7 @@ class RowBlock(eqx.Module):
     by_own: Float[AnyArray, "k r m"] | None
     class_index: int = eqx.field(static=True)  # index of the class of these components; -1 without
     sizes: tuple[int, ...] = eqx.field(static=True)  # poses of each of them, in their order
+    counts: tuple[int, ...] = eqx.field(static=True, default=())  # equations of each pose, where these are not r
 
 
 class PointRows(NamedTuple):
@@ -70,9 +76,11 @@ class PointRows(NamedTuple):
     rows: list[Rows]  # of each group
 
 
-def rows_at(space: Parameters, observed: Observed, z: Float[AnyArray, " z"], batch: bool = False) -> PointRows:
+def rows_at(
+    space: Parameters, observed: Observed, z: Float[AnyArray, " z"], batch: bool = False, whole: bool = False
+) -> PointRows:
     """The residuals of every group, with their derivatives by tips and unknowns; in a ``batch`` in the way that is
-    fastest there, through which no derivative passes."""
+    fastest there, through which no derivative passes. Those of kinds that reduce theirs are not if ``whole``."""
     p, rows = len(space.names), []
     chain = observed.chain(space, z[:p], z[p:])
     if batch and chain.corrections is None and observed.motion is not None:
@@ -89,7 +97,8 @@ def rows_at(space: Parameters, observed: Observed, z: Float[AnyArray, " z"], bat
             else:
                 index = np.asarray(role.first)[None, :] + np.arange(role.size)[:, None]
                 unknowns[name] = to_poses(z[p:][index], group.counts)
-        rows.append(stack.residual_with_errors(tips_of(forward, group.index), unknowns))
+        residual = stack.residual if whole and stack.reduces else stack.residual_with_errors
+        rows.append(residual(tips_of(forward, group.index), unknowns))
     return PointRows(forward, rows)
 
 
@@ -109,7 +118,8 @@ def row_blocks(
         turned = rotation_columns(forward, shared.few) if rotates else None
     own_probe = np.array([kind == "probe" for kind, _ in shared.few])
     blocks = []
-    for group, stack, rows, root in zip(layout.groups, observed.stacks, point.rows, whitening.roots, strict=True):
+    parts = zip(layout.groups, observed.stacks, point.rows, whitening.roots, strict=True)
+    for number, (group, stack, rows, root) in enumerate(parts):
         poses = group.index
         tip_columns = columns[..., poses]
         if root is None and stack.linear:  # a tip less a point
@@ -118,7 +128,12 @@ def row_blocks(
             blocks.append(RowBlock(rows.values, by_head, None, group.class_index, group.sizes))
             continue
         assert root is not None
-        rows = _whitened(rows, root)
+        if stack.reduces and rows.basis is None:
+            basis = whitening.bases[number]
+            assert basis is not None
+            rows = stack.reduced(rows, stack.shift, (basis, root))
+        else:
+            rows = _whitened(rows, root)
         if group.targeted and own_probe.any():
             tip_columns = xp.where(own_probe[:, None, None], 0.0, tip_columns)
         by_parameters = times(rows.by_tip, tip_columns)
@@ -131,7 +146,8 @@ def row_blocks(
             by_roles.append(times(rows.by_tip, xp.stack([axis[:, poses] for axis in forward.frame])))
         by_head = _by_head(by_parameters, by_roles, group, layout.shared)
         by_own = None if group.class_index < 0 else _by_own(by_roles, group, layout.classes[group.class_index][1])
-        blocks.append(RowBlock(rows.values, by_head, by_own, group.class_index, group.sizes))
+        counts = tuple(stack.pose_equations.tolist()) if stack.reduces else ()
+        blocks.append(RowBlock(rows.values, by_head, by_own, group.class_index, group.sizes, counts))
     return [*blocks, *_relations(observed, z[p:], whitening, p)]
 
 
@@ -235,6 +251,8 @@ def times(matrices: Float[AnyArray, "r c m"], columns: Float[AnyArray, "k c m"])
     """One matrix a pose times its columns, written as sums: XLA computes many products of small matrices several times
     as slowly."""
     xp = namespace(matrices, columns)
+    if xp is np and columns.shape[1] > _SMALL:
+        return np.moveaxis(np.moveaxis(matrices, 2, 0) @ np.moveaxis(columns, (2, 1), (0, 1)), (0, 1, 2), (2, 1, 0))
     return xp.stack([sum(row[c][None] * columns[:, c] for c in range(columns.shape[1])) for row in matrices], axis=1)
 
 
@@ -252,4 +270,6 @@ def whitening_of(
     xp = namespace([part.values for part in rows], of_arm, least)
     roots = tuple(inverse_cholesky(part.measured + arm) for part, arm in zip(rows, of_arm, strict=True))
     certified = {name: 1 / xp.maximum(u, least) for name, (_, u) in observed.certified().items()}
-    return Whitening(roots, 1 / xp.maximum(observed.u, least), certified)
+    bases = tuple(part.basis for part in rows)
+    known = any(basis is not None for basis in bases)
+    return Whitening(roots, 1 / xp.maximum(observed.u, least), certified, bases=bases if known else ())

@@ -2,6 +2,10 @@ from .arm import arm_at_zero as arm_at_zero
 from .arm import arm_poses as arm_poses
 from .arm import arm_workspace as arm_workspace
 from .arm import save_arm_figure as save_arm_figure
+from .cameras import camera_coverage as camera_coverage
+from .cameras import camera_distortion as camera_distortion
+from .cameras import camera_poses as camera_poses
+from .cameras import camera_residuals as camera_residuals
 from .drift import drift_trend as drift_trend
 from .drift import save_drift_trend as save_drift_trend
 from .lengths import acceptance_metrics as acceptance_metrics

@@ -55,7 +55,8 @@ class Marks(NamedTuple):
         if not self.limits:
             return []
         step = 1.01 * max(min(np.diff(self.limits)), 1e-9)  # so that 0.0999 has the decimals of 0.1
-        decimals = max(1 - int(np.floor(np.log10(step))), 0)
+        whole = all(limit == round(limit) for limit in self.limits)
+        decimals = 0 if whole else max(1 - int(np.floor(np.log10(step))), 0)
         return [f"{low:.{decimals}f} to {high:.{decimals}f} {self.unit}".strip() for low, high in pairwise(self.limits)]
 
 
@@ -92,6 +93,7 @@ class Plot(NamedTuple):
     title: str = ""
     height: int = 300  # pixels, of the axes
     square: bool = False  # both axes equally long
+    image: bool = False  # an image plane: as wide and high as its numbers, on a page too
 
 
 class Chart(NamedTuple):

@@ -39,7 +39,7 @@ def draw(plot: Plot, axes: Any = None, size: tuple[float, float] = (6.4, 4.2), *
     if not any(marks.box[1] for marks in plot.marks):
         axes.grid(True, which="major", alpha=0.3)
     axes.set_axisbelow(True)
-    if plot.square:
+    if plot.square or plot.image:
         axes.set_aspect("equal")
     handles, labels = axes.get_legend_handles_labels()
     if legend and labels:

@@ -29,13 +29,15 @@ def drawn(plot: Plot, label: str) -> str:
         for kind, words in (("plot-title", plot.title), ("axis-title", y.title), ("axis-title below", x.title))
     )
     style = f"padding:6px 12px {below:.0f}px {left:.0f}px"
-    ratio = ' square"' if plot.square else '"'
+    ratio = abs((x.high - x.low) / (y.high - y.low))
+    size = f"--ratio:{ratio:.3f}" if plot.image else f"--height:{plot.height}px"
+    kind = " square" if plot.square else " image" if plot.image else ""
     # Lines across are below everything else.
     ordered = sorted(plot.marks, key=lambda marks: marks.symbol not in ("level", "border"))
     body = "".join((*_grid(plot), *(part for marks in ordered for part in _marks(plot, marks)), *_labels(plot)))
     return (
-        f'<div class="plot">{title}{y_title}<div class="axes{ratio} style="{style}">'
-        f'<svg role="img" aria-labelledby="{label}" style="--height:{plot.height}px">{body}</svg></div>'
+        f'<div class="plot">{title}{y_title}<div class="axes{kind}" style="{style}">'
+        f'<svg role="img" aria-labelledby="{label}" style="{size}">{body}</svg></div>'
         f"{x_title}</div>"
     )
 

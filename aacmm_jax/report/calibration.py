@@ -63,6 +63,7 @@ def calibration_report(record: CalibrationRecord) -> Report:
             _scale(record, summary, evaluations),
             sections.parameters(record, summary),
             *sections.residuals(record, summary, evaluations["calibrated"]),
+            *sections.cameras(record, summary),
             *sections.patterns(record),
             sections.arm_in_poses(record, evaluations["calibrated"]),
             sections.volume(volume, summary),

@@ -12,10 +12,13 @@ from ..diagnostics.joint_travel import tried_poses
 from ..diagnostics.pose_residuals import observation_residuals
 from ..kinematics.arm import joint_limits, parameter_unit
 from ..model.sockets import pose_outliers
+from ..plot.cameras import coverage_chart, distortion_chart, images_of, residual_chart
 from ..plot.charts import Chart, Marks, Plot, linear, names, thinned
 from ..plot.lengths import tried_chart, volume_chart
 from ..plot.parameters import bounds_chart, change_chart, correlation_chart, functions_chart, singular_chart
 from ..plot.residuals import Groups, distances_in, kinds_chart, pattern_charts
+from ..summaries.camera_tables import camera_view, images_words
+from ..summaries.cameras import image_rows
 from ..summaries.result_tables import (
     geometry_table,
     harmonics_table,
@@ -40,7 +43,8 @@ from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.coverage import LEVEL_IN_PERCENT
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
-from .elements import DRAWN, Block, Section, residual_chart, socket_table, view_of_arm
+from .elements import DRAWN, Block, Section, socket_table, view_of_arm
+from .elements import residual_chart as pose_residuals
 
 _INDICES = {
     "O1": "geometric mean of the singular values (Menq, Borm)",
@@ -88,7 +92,7 @@ def residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Ev
             "The distance of each pose's tip from the centroid of its socket, computed with the calibrated arm. Poses "
             "with more than eight times the median distance are marked: check how the tip was seated in these poses."
         )
-        blocks = [introduction, socket_table(capture, evaluation), residual_chart(capture, evaluation)]
+        blocks = [introduction, socket_table(capture, evaluation), pose_residuals(capture, evaluation)]
         return [Section("residuals", "Residuals by socket and pose", blocks)]
     parts, groups = observation_residuals(record), Groups.of(capture)
     introduction = (
@@ -113,6 +117,16 @@ def residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Ev
         Section("residuals", "Residuals by observation and pose", blocks),
         Section("geometry", "Geometry found", [introduction, geometry_table(summary["geometry"], factor)]),
     ]
+
+
+def cameras(record: CalibrationRecord, summary: dict[str, Any]) -> list[Section]:
+    """Mounts, places of targets and intrinsics; and for each camera where it saw corners, their residuals, and its
+    distortion."""
+    blocks: list[Block] = [*images_words(image_rows(record.recording)), *camera_view(summary)]
+    for image in images_of(record):
+        charts = coverage_chart(image), residual_chart(image, DRAWN), distortion_chart(image)
+        blocks += filter(None, charts)
+    return [Section("cameras", "Cameras", blocks)] if blocks else []
 
 
 def patterns(record: CalibrationRecord) -> list[Section]:

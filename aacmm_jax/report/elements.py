@@ -13,10 +13,12 @@ from ..core.numpy_or_jax import AnyArray
 from ..core.units import people_read
 from ..data.capture import Capture
 from ..data.observations.observation import POINT, offset_of
+from ..data.observations.pixels import Pixels
 from ..diagnostics.pose_residuals import distances_of, observation_residuals
 from ..kinematics.arm import Arm
 from ..kinematics.workspace import arm_reach, skeleton
 from ..model.sockets import pose_outliers
+from ..plot.cameras import shapes_of
 from ..plot.charts import Chart, thinned
 from ..plot.residuals import Groups, distances_in, pose_chart
 from ..summaries.observations import capture_observations
@@ -90,7 +92,8 @@ def view_of_arm(
     owner, labels, chosen = groups.owner, groups.labels, thinned(len(q), _VIEWED)
     tips = np.asarray(arm.position(capture.q))
     marks = {name: tips[capture.owner == i].mean(axis=0) for i, name in enumerate(capture.names)}
-    lines = skeleton(arm, q[chosen])
+    lines, moving = skeleton(arm, q[chosen]), dict[int, np.ndarray]()
+    still: list[np.ndarray] = []
     for i, observation in enumerate(capture.observations, start=len(capture.names)):
         points = [part for part, units in observation.unknowns.items() if units == POINT]
         # A part with certified values has its numbers in a frame of its own.
@@ -99,13 +102,20 @@ def view_of_arm(
             of_target = owner[chosen] == i
             held = arm.replace(probe=geometry[offset_of(observation.target)])
             lines[of_target] = skeleton(held, q[chosen[of_target]])
+        if isinstance(observation, Pixels):
+            shapes, shape = shapes_of(arm, observation, geometry)
+            moving |= dict(enumerate(shapes, start=int(np.searchsorted(owner, i))))
+            still.append(shape)
+            marks[observation.still] = geometry[observation.frame][3:]
     data: dict[str, Any] = {
         "marks": [{"name": name, "at": np.round(at, 1).tolist()} for name, at in marks.items()],
+        "lines": [np.round(line, 1).tolist() for line in still],
         "from": "geometry" if capture.observations else "socket's centroid",
         "poses": [
             {
                 "label": labels[i],
                 "points": np.round(line, 1).tolist(),
+                "carried": np.round(moving.get(int(i), ()), 1).tolist(),
                 "distance": float(f"{distances[i]:.4g}") if np.isfinite(distances[i]) else None,
             }
             for i, line in zip(chosen, lines, strict=True)
@@ -116,7 +126,8 @@ def view_of_arm(
     return ArmView(
         "scene",
         f"The calibrated arm{points} and its poses",
-        "Drag, or use the arrow keys, to rotate the view; press plus or minus to zoom. The slider selects the pose.",
+        "Drag, or use the arrow keys, to rotate the view; press plus or minus to zoom. The slider selects the pose."
+        + (" A pyramid is the field of view of a camera, a frame the outline of a target." if still else ""),
         data,
     )
 

@@ -95,13 +95,14 @@
   // The arm: lines in space, rotated about the vertical and tilted, as SVG, which prints and scales.
   const SVG = "http://www.w3.org/2000/svg";
   function scene(container) {
-    const { marks, from, poses, reach } = parsed("scenes")[container.dataset.scene];
+    const { marks, lines, from, poses, reach } = parsed("scenes")[container.dataset.scene];
     const view = { turn: -0.9, tilt: 0.45, size: 1, pose: 0 };
     const svg = document.createElementNS(SVG, "svg");
     svg.setAttribute("role", "img");
     svg.setAttribute("aria-label", container.getAttribute("aria-label"));
     container.append(svg);
-    const all = [[0, 0, 0], ...marks.map((mark) => mark.at), ...poses.flatMap((p) => p.points)];
+    const all = [[0, 0, 0], ...marks.map((mark) => mark.at), ...lines.flat(),
+      ...poses.flatMap((p) => [...p.points, ...p.carried])];
     const middle = [0, 1, 2].map((i) => (Math.min(...all.map((p) => p[i])) + Math.max(...all.map((p) => p[i]))) / 2);
     const extent = Math.max(...all.map((p) => Math.hypot(...p.map((x, i) => x - middle[i]))), 1);
     const shadows = poses.filter((_, i) => i % Math.max(1, Math.ceil(poses.length / 24)) === 0);
@@ -141,9 +142,12 @@
       }
       for (const pose of shadows) {
         add("polyline", { points: path(pose.points), class: "other-pose" });
+        add("polyline", { points: path(pose.carried), class: "other-pose" });
       }
+      for (const line of lines) add("polyline", { points: path(line), class: "instrument" });
       const now = poses[view.pose];
       add("polyline", { points: path(now.points), class: "this-pose" });
+      add("polyline", { points: path(now.carried), class: "instrument" });
       for (const point of now.points) {
         const [cx, cy] = project(point);
         add("circle", { cx, cy, r: 4, class: "joint" });

@@ -40,6 +40,15 @@ class ObservationRows(NamedTuple):
     by_private: Float[AnyArray, "k r m"]  # and by the geometry that it alone uses
     private: np.ndarray  # indices of that among all geometry
 
+    def without_rest(self) -> "ObservationRows":
+        """Without the row of those that are reduced which stands for many: see `data.observations.reduced_rows`."""
+        if not self.observation.reduces:
+            return self
+        rows = {name: getattr(self, name)[:-1] for name in ("values", "by_tip", "by_readings", "by_seat", "white")}
+        columns = {name: getattr(self, name)[:, :-1] for name in ("by_head", "by_private")}
+        square = {name: getattr(self, name)[:, :-1, :-1] for name in ("measured", "root")}
+        return self._replace(**rows, **columns, **square)
+
 
 class Linearisation(NamedTuple):
     """A problem linear at a point."""

@@ -68,7 +68,10 @@ def moments(
         readings, seat, measured = row_errors(part, error, root, xp.asarray(one_arcsec(error.kinds)))
         parts.append((products(readings, readings), products(seat, seat), measured))
     plain = [list(matrices) for matrices in zip(*parts, strict=True)]  # D, T and S of each group
-    white = [block.white for block in influence.blocks[: len(rows)]]
+    white = [
+        block.white if part.basis is None else xp.where(_last(block.white), 0.0, block.white)
+        for part, block in zip(rows, influence.blocks, strict=False)
+    ]
     columns = [_Sums.of(influence, matrices, weighted=True) for matrices in plain]
 
     def solved(forms: list[list[Any]], counts: list[Any]) -> Moments:
@@ -179,6 +182,17 @@ def _each(matrices: Float[AnyArray, "m r s"], vectors: Float[AnyArray, "s m"]) -
     return products(namespace(matrices).moveaxis(matrices, 0, -1), vectors[None])[:, 0]
 
 
+def without_rest(rows: list[Rows]) -> list[Rows]:
+    """Rows in which those are 0 that stand for many and show nothing of the arm (`data.observations.reduced_rows`)."""
+    xp = namespace([part.values for part in rows])
+    kept = [part.values if part.basis is None else xp.where(_last(part.values), 0.0, part.values) for part in rows]
+    return [part._replace(values=values) for part, values in zip(rows, kept, strict=True)]
+
+
+def _last(values: Float[AnyArray, "r m"]) -> np.ndarray:
+    return np.broadcast_to(np.arange(len(values))[:, None] == len(values) - 1, values.shape)
+
+
 def scatter_of(
     rows: list[Rows], errors: list[ArmErrors], degrees_of_freedom: Float[AnyArray, ""] | float
 ) -> Float[AnyArray, ""]:
@@ -187,7 +201,7 @@ def scatter_of(
     The sum of w.w over all rows equals its degrees of freedom (Paule and Mandel 1982); 0 where what was measured
     explains more than all. Its derivative is that of the implicit equation.
     """
-    xp = namespace([part.values for part in rows], errors, degrees_of_freedom)
+    xp, rows = namespace([part.values for part in rows], errors, degrees_of_freedom), without_rest(rows)
 
     def excess(log_sigma: Any, rows: list[Rows], errors: list[ArmErrors], expected: Any) -> tuple[Any, Any]:
         """Of the weighted sum over its expectation, and its derivative by the logarithm of sigma."""
@@ -231,16 +245,17 @@ def robust_scatter_of(
 ) -> Float[AnyArray, ""]:
     """The same from the median of the poses' squared residuals, each over its median for normal errors: a few bad poses
     do not change it much."""
-    xp = namespace([part.values for part in rows], errors)
+    xp, rows = namespace([part.values for part in rows], errors), without_rest(rows)
     constant, expected = stop_gradient((rows, errors)), stop_gradient(degrees_of_freedom)
-    count = sum(part.values.size for part in rows)
+    lengths = [len(part.values) - (part.basis is not None) for part in rows]
+    count = sum(length * part.values.shape[1] for length, part in zip(lengths, rows, strict=True))
 
     def rescale(log_sigma: Any, _: Any) -> tuple[Any, Any]:
         squares = []
-        for part, error in zip(*constant, strict=True):
+        for part, error, length in zip(*constant, lengths, strict=True):
             inverse = inverse_positive_definite(part.measured + covariance_of_sigma(error, xp.exp(log_sigma)))
             square = xp.einsum("rm,mrs,sm->m", part.values, inverse, part.values)
-            squares.append(square / median_square(part.values.shape[0]))
+            squares.append(square / median_square(length))
         ratio = xp.median(xp.concatenate(squares)) * count / expected
         return xp.maximum(log_sigma + 0.5 * xp.log(ratio + 1e-300), np.log(LEAST_SIGMA)), xp.zeros(())
 

@@ -117,8 +117,9 @@ def test_shapes_and_derivatives(name):
 def check_derivatives(observation, unknowns):
     """Analytic derivatives by the tips, their orientation and every unknown agree with central differences."""
     rows = observation.residual(TIPS, unknowns)
-    assert rows.values.shape == (observation.rows, POSES)
-    assert rows.measured.shape == (POSES, observation.rows, observation.rows)
+    counted = observation.residual_with_errors(TIPS, unknowns)
+    assert counted.values.shape == (observation.rows, POSES)
+    assert counted.measured.shape == (POSES, observation.rows, observation.rows)
     assert set(rows.by_unknowns) == set(observation.unknowns)
     for part, units in observation.unknowns.items():
         assert unknowns[part].shape == (len(units), 1)

@@ -22,6 +22,7 @@ from tests.refusals import assert_refused
 from tests.written_study import write_study
 
 HOSTILE = '<script>document.title="taken"</script><img src=x onerror=alert(1)> & "B" <b>bold</b>'
+KINDS = ("calibration", "evaluation", "study", "observations", "camera")
 STUDY = {
     "arm": "cheng2018-simulation",
     "trials": 4,
@@ -32,7 +33,7 @@ STUDY = {
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory, observed_record):
+def written(tmp_path_factory, observed_record, camera_records):
     """The files and reports of a simulated arm with hostile names: calibration, evaluation, study; and of a calibration
     from observations, two of which have hostile names."""
     folder = tmp_path_factory.mktemp("reports")
@@ -58,7 +59,8 @@ def written(tmp_path_factory, observed_record):
     aj.files.save_evaluation(folder / "evaluation.h5", evaluation)
     write_study(folder / "study.h5", aj.study.make_study(**{**STUDY, "arm": nominal.arm}))
     aj.files.save_calibration(folder / "observations.h5", with_hostile_names(observed_record))
-    pages = {kind: folder / f"{kind}.html" for kind in ("calibration", "evaluation", "study", "observations")}
+    aj.files.save_calibration(folder / "camera.h5", camera_records["fixed"])
+    pages = {kind: folder / f"{kind}.html" for kind in KINDS}
     for kind, page in pages.items():
         write_report(folder / f"{kind}.h5", page)
     return SimpleNamespace(folder=folder, pages=pages, record=record, evaluation=evaluation)
@@ -113,7 +115,7 @@ def test_a_target_that_cannot_be_written_is_refused(written):
     assert_refused(lambda: write_report(source, source), "one of the files that this command reads")
 
 
-@pytest.fixture(scope="module", params=["calibration", "evaluation", "study", "observations"])
+@pytest.fixture(scope="module", params=KINDS)
 def page(request, written):
     found = Page(written.pages[request.param].read_text(encoding="utf-8"))
     found.kind = request.param
@@ -128,7 +130,9 @@ def test_text_of_people_never_becomes_markup(page):
     if page.kind == "evaluation":
         assert f"Beware of {HOSTILE}" in page.text
         assert f"About the calibration: Not {HOSTILE}" in page.text
-    if page.kind != "study":  # a study knows its arm by the name that its maker gave in Python: none
+    if page.kind == "camera":
+        assert 'Distortion of the "<b>webcam</b>"' in page.text
+    elif page.kind != "study":  # a study knows its arm by the name that its maker gave in Python: none
         assert HOSTILE in page.text
     for name in ("points", "scenes"):
         assert "<" not in page.held[name]
@@ -284,6 +288,28 @@ def test_a_report_of_observations_by_kind_observation_and_pose(observed_record, 
     arm = observed_record.calibrated.arm.replace(probe=values)
     q = observed_record.recording.capture.observations[0].q
     np.testing.assert_allclose([pose["points"][-1] for pose in transforms], arm.position(q), atol=0.06)
+
+
+@pytest.mark.slow
+def test_a_report_of_a_camera(camera_records):
+    """Its section has the mount and three charts; the view of the arm has what is on the arm in each pose, and what
+    stands still."""
+    from aacmm_jax.report.calibration import calibration_report
+
+    for record in camera_records.values():
+        report = calibration_report(record)
+        section = next(section for section in report.sections if section.id == "cameras")
+        shown = [block.id for block in section.blocks if isinstance(block, charts.Chart)]
+        assert shown == ["coverage-1", "arrows-1", "distortion-1"]
+        assert any(isinstance(block, Table) and block.title.startswith("Cameras") for block in section.blocks)
+        scene = next(
+            block for section in report.sections for block in section.blocks if isinstance(block, elements.ArmView)
+        )
+        [observation] = record.recording.capture.observations
+        pyramid, outline = 12, 5  # points of their lines
+        assert {len(pose["carried"]) for pose in scene.data["poses"]} == {pyramid if observation.on_arm else outline}
+        assert [len(line) for line in scene.data["lines"]] == [outline if observation.on_arm else pyramid]
+        assert [mark["name"] for mark in scene.data["marks"]] == [observation.still]
 
 
 def test_a_report_says_what_was_decided_by_default(observed_record):
@@ -666,10 +692,16 @@ def shown(browser, written):
 @pytest.mark.parametrize(
     ("kind", "width"),
     [
-        *(("calibration", 400), ("evaluation", 1600), ("study", 400), ("observations", 400)),
+        *(("calibration", 400), ("evaluation", 1600), ("study", 400), ("observations", 400), ("camera", 400)),
         *(
             pytest.param(kind, width, marks=pytest.mark.slow)
-            for kind, width in (("calibration", 1600), ("evaluation", 400), ("study", 1600), ("observations", 1600))
+            for kind, width in (
+                ("calibration", 1600),
+                ("evaluation", 400),
+                ("study", 1600),
+                ("observations", 1600),
+                ("camera", 1600),
+            )
         ),
     ],
 )

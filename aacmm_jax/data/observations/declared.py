@@ -276,6 +276,11 @@ def checked_ids(value: Any, what: str, sizes: Sizes) -> Identifiers:
     return tuple(map(tuple, array.astype(int).tolist()))
 
 
+def is_known(u: AnyArray) -> Any:
+    """Which values are known, and not only a start."""
+    return np.asarray(u) < FREE if is_concrete(u) else np.ones(u.shape, dtype=bool)
+
+
 def is_exact(u: AnyArray) -> bool:
     """Whether a certified value is exact, and not an unknown of its own; a traced uncertainty is not known to be 0."""
     return is_concrete(u) and float(u) == 0

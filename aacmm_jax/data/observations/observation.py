@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from ...core.errors import InputError
 from ...core.linear_algebra import inverse_positive_definite, products_by_column
@@ -60,6 +60,8 @@ class Rows(NamedTuple):
     by_unknowns: dict[str, Float[AnyArray, "k r m"]]
     measured: Float[AnyArray, "m r r"]  # covariance of what was measured, without the arm's own errors
     by_rotation: Float[AnyArray, "r 3 m"] | None = None  # by a small rotation of the last frame, rad
+    # Of rows that are reduced (`reduced_rows`): the orthonormal combinations of the rows before.
+    basis: Float[AnyArray, "m s n"] | None = None
 
 
 class Quantity(NamedTuple):
@@ -87,6 +89,7 @@ class AbstractObservation(Declared):
     row_units: tuple[str, ...]
     derived: ClassVar[tuple[str, ...]] = ()  # fields of `completed` that are no entries
     rotates: ClassVar[bool] = False  # whether the residual depends on the rotation of the last frame
+    reduces: ClassVar[bool] = False  # whether it has so many residuals a pose that they are reduced to fewer rows
     stacks: ClassVar[bool] = True  # whether it can be evaluated together with others of the kind: see `alike`
     # Whether geometry that no other observation uses is eliminated; else it stands beside the arm's parameters, so that
     # there is something to solve for where no parameter is free.
@@ -151,10 +154,20 @@ class AbstractObservation(Declared):
         return len(self.row_units)
 
     @property
-    def present(self) -> Bool[np.ndarray, "r m"] | None:
-        """Which residuals there are, where some are absent: these are 0 with derivatives 0 and variance 1, and count
-        nowhere. None where all are there."""
+    def equations(self) -> Int[np.ndarray, "r m"] | None:
+        """How many equations each row stands for, where this is not 1 for all (None): several of the last row where
+        rows are reduced, none of a row that a pose lacks."""
         return None
+
+    @property
+    def pose_equations(self) -> Int[np.ndarray, " m"]:
+        """How many equations each pose gives."""
+        counts = self.equations
+        return np.full(self.q.shape[-2], self.rows) if counts is None else counts.sum(axis=0)
+
+    def reduced(self, rows: Rows, shift: AnyArray | None = None, weights: Any = None) -> Rows:
+        """The residuals of a kind that `reduces`, as fewer rows that say the same: see `reduced_rows`."""
+        return rows
 
     @property
     def lengths(self) -> int:
@@ -165,6 +178,11 @@ class AbstractObservation(Declared):
     def other_unit(self) -> str:
         """The unit of the residuals that are not in mm; empty where all of them are."""
         return self.row_units[-1] if self.rows > self.lengths else ""
+
+    def other_sizes(self, rows: Float[AnyArray, "r m"]) -> Float[AnyArray, " m"]:
+        """The size of each pose's residuals that are not in mm; of a corner, where there are several."""
+        xp = namespace(rows)
+        return xp.sqrt(xp.sum(rows[self.lengths :] ** 2, axis=0))
 
     def in_mm(self, rows: Float[AnyArray, "r *k m"], by_tip: Float[AnyArray, "r 3 m"]) -> Float[AnyArray, "c *k m"]:
         """Residuals, or their derivatives by k numbers, as a vector whose length is the distance of the tip from the
@@ -229,6 +247,8 @@ class AbstractObservation(Declared):
     def residual_with_errors(self, tips: Tips, unknowns: Unknowns) -> Rows:
         """The residual, with what a repeated calibration adds."""
         rows = self.residual(tips, unknowns)
+        if self.reduces:
+            return self.reduced(rows, self.shift)
         return rows if self.shift is None else rows._replace(values=rows.values + self.shift)
 
     def with_errors(

@@ -29,6 +29,7 @@ from .observation import (
     displacement,
     offset_of,
 )
+from .reduced_rows import reduced_rows
 
 _OUTSIDE = 1.0  # px that a corner may lie outside of an image
 
@@ -41,8 +42,8 @@ class Pixels(AbstractObservation):
     those intrinsics that are not exact, and the scale of the target if that is uncertain. Observations that name the
     same camera or target share these. The camera's frame is that of `AbstractCamera`.
 
-    The residuals are projected less measured coordinates. Of absent corners, whose id is -1, they are 0 and count
-    nowhere.
+    The residuals are projected less measured coordinates, and 0 of absent corners, whose id is -1. They enter a
+    calibration as fewer rows, which say the same (`reduced_rows`).
 
     Raises:
         InputError: Shapes or names do not fit, a corner is outside of the image, the number of intrinsics is not one of
@@ -59,7 +60,7 @@ class Pixels(AbstractObservation):
         ['frame of board', 'orientation of webcam']
     """
 
-    kind, table, rotates, stacks, eliminates = "pixels", "pixels", True, False, False
+    kind, table, rotates, reduces, stacks, eliminates = "pixels", "pixels", True, True, False, False
     fixes_scale = True
     derived = ("still", "unsure")
     corners: Float[AnyArray, "m c d"] = declared(
@@ -189,15 +190,15 @@ class Pixels(AbstractObservation):
         """Which corners are present."""
         return np.array(self.ids) >= 0
 
-    @property
-    def present(self) -> Bool[np.ndarray, "r m"] | None:
-        if self.seen.all():
-            return None
-        return np.repeat(self.seen, self.corners.shape[2], axis=1).T
+    @functools.cached_property
+    def equations(self) -> Int[np.ndarray, "r m"] | None:
+        measured, n = self.corners.shape[2] * self.seen.sum(axis=1), self.rows - 1
+        return np.concatenate([np.arange(n)[:, None] < measured, np.maximum(measured - n, 0)[None]]).astype(int)
 
     def changed(self, **fields: Any) -> Any:
         made = super().changed(**fields)
-        vars(made).pop("seen", None)
+        for derived in ("seen", "equations"):
+            vars(made).pop(derived, None)
         return made
 
     @property
@@ -211,7 +212,13 @@ class Pixels(AbstractObservation):
 
     @property
     def row_units(self) -> tuple[str, ...]:
-        return (self.camera_model.unit,) * (self.corners.shape[-2] * self.corners.shape[-1])
+        return (self.camera_model.unit,) * (7 + len(self._own_units))
+
+    @property
+    def _own_units(self) -> tuple[str, ...]:
+        """Of the unknowns that do not move the target as a whole."""
+        own = tuple(self.camera_model.units[i] for i in self.unsure)
+        return own if is_exact(self.u_scale) else (*own, "1")
 
     @property
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
@@ -242,6 +249,9 @@ class Pixels(AbstractObservation):
     def in_session(self, session: str, probe: str) -> "AbstractObservation":
         made = super().in_session(session, probe)
         return made.changed(still=f"{session}/{self.still}")
+
+    def other_sizes(self, rows: Float[AnyArray, "r m"]) -> Float[AnyArray, " m"]:
+        return super().other_sizes(rows) / namespace(rows).asarray(np.sqrt(self.seen.sum(axis=1)))
 
     def in_mm(self, rows: Float[AnyArray, "r *k m"], by_tip: Float[AnyArray, "r 3 m"]) -> Float[AnyArray, "c *k m"]:
         return displacement(rows, by_tip)
@@ -307,14 +317,19 @@ class Pixels(AbstractObservation):
             kept = xp.where(present.reshape(*(1,) * (values.ndim - 2), m, c), values, 0.0)
             return xp.moveaxis(kept, (-1, -3, -2), (-3, -2, -1)).reshape(*values.shape[:-3], c * d, m)
 
-        variance = (self.u**2).reshape(m, c * d)
         return Rows(
             values=rows(seen.values - xp.moveaxis(self.corners, -1, 0)),
             by_tip=xp.swapaxes(rows(sign * by_shift), 0, 1),
             by_unknowns={name: rows(values) for name, values in by.items()},
-            measured=variance[:, :, None] * xp.asarray(np.eye(c * d))[None],
+            measured=xp.zeros((m, 0, 0)),
             by_rotation=xp.swapaxes(rows(by_carried), 0, 1),
         )
+
+    def reduced(self, rows: Rows, shift: AnyArray | None = None, weights: Any = None) -> Rows:
+        xp, (m, c, d) = namespace(rows.values, self.u), self.corners.shape
+        weight = xp.where(xp.asarray(self.seen)[..., None], 1 / self.u, 0.0).reshape(m, c * d)
+        own = tuple(name for name in (self.optics, self.scale) if name in rows.by_unknowns)
+        return reduced_rows(rows, weight, own, shift, weights)
 
 
 def _crossed(arms: Float[AnyArray, "3 m c"], by_shift: Float[AnyArray, "3 d m c"]) -> Float[AnyArray, "3 d m c"]:
