@@ -60,7 +60,7 @@ def _of_terms(case: Case, terms: Sequence[FoundTerm], explains: float) -> Findin
         "missing-terms",
         f"Residuals follow {shorten(texts, 3)} ({chance_text(probability)}), which the model does not describe. "
         f"Possible causes: {', '.join(causes)}{f'; try --model {model}' if model else ''}."
-        + (f" Equally likely: {shorten(likely, 3)}." if likely else ""),
+        + (f" Equally likely: {shorten(likely, 3)}." if likely and len(events) < _SEVERAL else ""),
         "The stated uncertainties include these errors as estimated from the residuals."
         if shared - {PLACES, VISITS, SUCCESSIVE}
         else "Every stated uncertainty is too small.",

@@ -20,7 +20,7 @@ from ..core.numpy_or_jax import AnyArray, namespace, scan, stop_gradient, while_
 from ..core.units import ARCSEC
 from ..data.noise import Noise, noise_of, one_arcsec
 from ..data.observations.observation import Rows
-from ..model.elimination import sums_by_component
+from ..model.elimination import flat, sums_by_component
 from ..model.robust import bounded_square, median_square
 from ..model.rows import Whitening
 from .linear_propagation import (
@@ -169,7 +169,7 @@ def _expectation(influence: Influence, form: _Sums, column: _Sums) -> Any:
 
 
 def _outer(left: Float[AnyArray, "h r m"], right: Float[AnyArray, "h r m"]) -> Float[AnyArray, "h h"]:
-    return left.reshape(left.shape[0], -1) @ right.reshape(right.shape[0], -1).T
+    return flat(left) @ flat(right).T
 
 
 def noise_from(variances: Moments) -> Noise:

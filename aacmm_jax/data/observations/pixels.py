@@ -15,7 +15,7 @@ from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 from ...core.rotations import cross, rotation_and_derivative, rotation_matrix
 from ..cameras.camera import AbstractCamera, camera_models
 from ..cameras.views import Corners, views_of
-from .declared import FREE, Identifiers, Part, declared, is_exact
+from .declared import FREE, Identifiers, Part, declared, is_exact, is_known
 from .hand_eye import hand_eye
 from .observation import (
     FRAME,
@@ -60,7 +60,8 @@ class Pixels(AbstractObservation):
         ['frame of board', 'orientation of webcam']
     """
 
-    kind, table, rotates, reduces, stacks, eliminates = "pixels", "pixels", True, True, False, False
+    kind, table, rotates, reduces = "pixels", "pixels", True, True
+    stacks, eliminates = False, False
     fixes_scale = True
     derived = ("still", "unsure")
     corners: Float[AnyArray, "m c d"] = declared(
@@ -232,8 +233,8 @@ class Pixels(AbstractObservation):
     @property
     def certified(self) -> Certified:
         values: Certified = {}
-        if self.unsure:
-            index = np.array(self.unsure)
+        index = np.array(self.unsure, dtype=int)
+        if is_known(self.u_intrinsics[index]).any():
             values[self.optics] = (self.intrinsics[index], self.u_intrinsics[index])
         if not is_exact(self.u_scale):
             values[self.scale] = (np.ones(1), namespace(self.u_scale).reshape(self.u_scale, (1,)))
@@ -276,6 +277,8 @@ class Pixels(AbstractObservation):
         origins = tips.position - xp.einsum("cpm,p->cm", axes, offset)
         place, turn, frame = hand_eye(origins, axes, turns, shifts, counted)
         parts = {self.frame: frame, self.orientation: turn, offset_of(self.target): place}
+        if self.unsure:
+            parts[self.optics] = self.intrinsics[np.array(self.unsure)]
         return parts | {name: value for name, (value, _) in self.certified_values().items()}
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
