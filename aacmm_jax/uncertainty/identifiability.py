@@ -279,7 +279,8 @@ class _Spectrum(NamedTuple):
         # With as many rows of zeros as there are parameters all singular values and vectors are there.
         p = len(names)
         rows = np.concatenate([whitened.poses, whitened.relations, np.zeros((p, p))])
-        _, singular, vectors = np.linalg.svd(rows, full_matrices=False)
+        rows = np.linalg.qr(rows, mode="r")  # of the same singular values and vectors, and far fewer
+        _, singular, vectors = np.linalg.svd(rows)
         rank = int(np.sum(singular > _RANK * max(singular[0], 1e-300)))
         norms = np.linalg.norm(rows, axis=0)
         scale = np.where(norms > _RANK * norms.max(), norms, 1.0)  # others are rounding
