@@ -47,7 +47,8 @@ def detect(
 ) -> Detection:
     """Find the corners of a target in an image.
 
-    Corners that are hidden or outside the image are absent. A checkerboard has to be seen whole.
+    Corners that are hidden or outside the image are absent. A checkerboard has to be seen whole, and a mirrored image
+    of one cannot be told, since it is its own mirror image; markers tell both.
 
     Args:
         image: Image file, or grey levels ``(height, width)``.
