@@ -5,6 +5,7 @@ was stated, or in which two alike are seen.
 """
 
 import os
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -46,7 +47,8 @@ def detect(
 ) -> Detection:
     """Find the corners of a target in an image.
 
-    Corners that are hidden or outside the image are absent. A checkerboard has to be seen whole.
+    Corners that are hidden or outside the image are absent. A checkerboard has to be seen whole, and a mirrored image
+    of one cannot be told, since it is its own mirror image; markers tell both.
 
     Args:
         image: Image file, or grey levels ``(height, width)``.
@@ -106,9 +108,12 @@ def read_image(image: str | os.PathLike | Grey) -> Grey:
         return image
     import cv2
 
-    if not os.path.isfile(image):
-        raise InputError(f"{image} does not exist; give the path of an image.")
-    data = np.fromfile(image, dtype=np.uint8)
+    content = getattr(image, "content", None)  # of a file that was read already
+    if content is None:
+        if not os.path.isfile(image):
+            raise InputError(f"{image} does not exist; give the path of an image.")
+        content = Path(image).read_bytes()
+    data = np.frombuffer(content, dtype=np.uint8)
     try:
         grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
     except cv2.error:  # such as an image of billions of pixels

@@ -232,7 +232,9 @@ def reading_check(summary: dict[str, Any]) -> View:
 
 
 def survey(summary: dict[str, Any]) -> View:
-    """An arm before its first calibration."""
+    """An arm before its first calibration: what to record, then why."""
+    if summary["advice"]:
+        yield summary["advice"]
     yield from views.arm(summary)
     yield from warnings_of(summary)
     rows = [
@@ -255,7 +257,6 @@ def survey(summary: dict[str, Any]) -> View:
         yield from _determined(summary)
     for arm_class in summary["needed"]:
         yield from _needed(arm_class)
-        yield f"\n{summary['advice']}"
     yield from written_of(summary)
 
 

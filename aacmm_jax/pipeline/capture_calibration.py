@@ -28,6 +28,7 @@ from .automatic import (
     with_best_model,
     with_full_couplings,
     with_wider_bounds,
+    with_wrong_fixed_freed,
     without_contradicting,
     without_misplaced,
 )
@@ -104,9 +105,9 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         remove_contradicting: leave out groups that contradict all others.
         automatic: give too few data the prior and the noise of a real arm, leave out poses that were mixed up, correct
             readings that do not match the arm where one order, signs, zeros or unit explain them, find joints that move
-            with others, widen default bounds that the fit reaches, leave out what contradicts the rest, and compare
-            models of the joints unless a model, a prior, a method or a robust loss is stated. ``decisions`` of the
-            record says what was done and why.
+            with others, widen default bounds that the fit reaches, free parameters whose fixed value the data
+            contradict, leave out what contradicts the rest, and compare models of the joints unless a model, a prior,
+            a method or a robust loss is stated. ``decisions`` of the record says what was done and why.
         max_steps: most evaluations of each solve.
         stage: called with what is done next, in words, and a function that does it, such as to show progress.
 
@@ -165,6 +166,8 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         if mistake is None or mistake.of_bounds:
             if automatic:
                 record = chosen.stage("Checking bounds", lambda: with_wider_bounds(record, solved, recorded))
+                freed = lambda: with_wrong_fixed_freed(record, solved, recorded)  # noqa: E731
+                record = chosen.stage("Checking fixed parameters", freed)
             if chosen.remove_contradicting or (automatic and chosen.robust is None):  # which bad poses do not move
                 record = chosen.stage("Comparing groups", lambda: without_contradicting(record, solved, recorded))
             if automatic and not stated:
