@@ -38,7 +38,7 @@ def seen(arm, poses, seed, on_arm=True, noise=None, points=None, **options):
         "eye", poses, "webcam", "board", grid(8, 5, 25.0) if points is None else points, LENS, SIZE,
         on_arm=on_arm, **places | {"u": 0.3} | options,
     )  # fmt: skip
-    noise = {} if noise is None else {"noise": noise}
+    noise = {"noise": aj.Noise(encoder_arcsec=0.0, seating=0.0) if noise is None else noise}
     return aj.simulate(arm, {}, observations=[eye], seed=seed, **noise)
 
 

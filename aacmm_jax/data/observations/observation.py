@@ -149,6 +149,11 @@ class AbstractObservation(Declared):
         return {getattr(self, name): part.units_of(self) for name, part in present.items()}
 
     @property
+    def steps(self) -> Mapping[str, tuple[float, ...]]:
+        """Natural steps of parts of the geometry that are not those of their units."""
+        return {}
+
+    @property
     def rows(self) -> int:
         """Number of residuals of a pose."""
         return len(self.row_units)
@@ -158,6 +163,11 @@ class AbstractObservation(Declared):
         """How many equations each row stands for, where this is not 1 for all (None): several of the last row where
         rows are reduced, none of a row that a pose lacks."""
         return None
+
+    @property
+    def apart(self) -> tuple[str, ...]:
+        """Parts of the geometry of a kind that `reduces` which do not move the target as a whole."""
+        return ()
 
     @property
     def pose_equations(self) -> Int[np.ndarray, " m"]:

@@ -231,6 +231,15 @@ class Pixels(AbstractObservation):
         return parts
 
     @property
+    def apart(self) -> tuple[str, ...]:
+        return tuple(name for name in (self.optics, self.scale) if name in self.unknowns)
+
+    @property
+    def steps(self) -> Mapping[str, tuple[float, ...]]:
+        steps = self.camera_model.steps
+        return {self.optics: tuple(steps[i] for i in self.unsure)} if self.unsure else {}
+
+    @property
     def certified(self) -> Certified:
         values: Certified = {}
         index = np.array(self.unsure, dtype=int)
@@ -331,8 +340,7 @@ class Pixels(AbstractObservation):
     def reduced(self, rows: Rows, shift: AnyArray | None = None, weights: Any = None) -> Rows:
         xp, (m, c, d) = namespace(rows.values, self.u), self.corners.shape
         weight = xp.where(xp.asarray(self.seen)[..., None], 1 / self.u, 0.0).reshape(m, c * d)
-        own = tuple(name for name in (self.optics, self.scale) if name in rows.by_unknowns)
-        return reduced_rows(rows, weight, own, shift, weights)
+        return reduced_rows(rows, weight, self.apart, shift, weights)
 
 
 def _crossed(arms: Float[AnyArray, "3 m c"], by_shift: Float[AnyArray, "3 d m c"]) -> Float[AnyArray, "3 d m c"]:
