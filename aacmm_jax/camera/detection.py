@@ -43,7 +43,7 @@ class Detection(NamedTuple):
 
 @checked_arguments
 def detect(
-    image: str | os.PathLike | Grey, target: AbstractTarget, *, image_size: tuple[int, ...] | None = None
+    image: str | os.PathLike | np.ndarray, target: AbstractTarget, *, image_size: tuple[int, ...] | None = None
 ) -> Detection:
     """Find the corners of a target in an image.
 
@@ -102,9 +102,14 @@ def detect(
     return Detection(ids, corners, "", size, blur, note)
 
 
-def read_image(image: str | os.PathLike | Grey) -> Grey:
+def read_image(image: str | os.PathLike | np.ndarray) -> Grey:
     """Grey levels of an image as the sensor took it; a turn that the file asks viewers for is not made."""
     if isinstance(image, np.ndarray):
+        if image.ndim != 2 or image.dtype != np.uint8:
+            raise InputError(
+                f"the image is an array of shape {image.shape} and type {image.dtype}; give grey levels (height, "
+                "width) of type uint8."
+            )
         return image
     import cv2
 
@@ -124,7 +129,7 @@ def read_image(image: str | os.PathLike | Grey) -> Grey:
 
 
 @checked_arguments
-def overlay(image: str | os.PathLike | Grey, detection: Detection, *, longest: int = 800) -> bytes:
+def overlay(image: str | os.PathLike | np.ndarray, detection: Detection, *, longest: int = 800) -> bytes:
     """A picture of an image with the corners that were found in it, and their ids or why it is refused.
 
     Args:
