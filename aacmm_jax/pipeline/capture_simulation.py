@@ -89,7 +89,7 @@ def simulate_capture(
         if sockets or any(of_sockets) or np.any(chosen.resolution_arcsec):
             raise InputError(
                 "--acceptance determines the sockets, poses, lengths and temperature (20 C) itself; leave out "
-                "--socket, --kit, --poses, --length, --resolution-arcsec, --linear-resolution-mm and --temperature-c."
+                "--socket, --poses, --length, --resolution-arcsec, --linear-resolution-mm, --temperature-c and --kit."
             )
         procedure = plan_procedure(nominal.arm, chosen.acceptance)
         u = {"u_length": _U_ARTEFACT, "u_diameter": _U_ARTEFACT}
