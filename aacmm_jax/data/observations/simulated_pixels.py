@@ -11,10 +11,9 @@ from ...core.errors import InputError
 from ...core.rotations import rotation_matrix
 from ..cameras.camera import AbstractCamera, camera_models
 from .declared import FREE, declared
-from .observation import AbstractSimulated, Readings, Transforms
+from .observation import AbstractSimulated, Aim, Readings, Transforms
 from .pixels import Pixels
 
-_TRIED = 25  # random poses for each one that is wanted
 _ASIDE = 0.35  # of the target's size: how far from its middle the camera looks
 
 
@@ -32,7 +31,7 @@ class SimulatedPixels(AbstractSimulated):
         (10, 24, 2) ['frame of board', 'orientation of webcam']
     """  # fmt: skip
 
-    table = "pixels"
+    table, spares = "pixels", 25
     poses: int = declared("number of poses")
     camera: str = declared("camera")
     board: str = declared("target that the camera sees")
@@ -69,10 +68,11 @@ class SimulatedPixels(AbstractSimulated):
         self.camera_model.check_count(len(self.intrinsics), where)
         if not 0 < self.distance[0] <= self.distance[1]:
             raise InputError(f"distance of {where} is {self.distance}; give the least and the largest one, above 0.")
-        turn = np.asarray(rotation_matrix(self.mount[3:]))
+        turn, still = (np.asarray(rotation_matrix(w)) for w in (self.mount[3:], self.frame[:3]))
         # The tip that is led: a point before the camera, or the middle of the target.
         ahead = np.array([0.0, 0.0, self.distance.mean()]) if self.on_arm else self.middle
-        return {"offset": self.mount[:3] + turn @ ahead}
+        axis, normal, place = (tuple(map(float, part)) for part in (turn[:, 2], -still[:, 2], self.mount[:3]))
+        return {"offset": self.mount[:3] + turn @ ahead, "aim": Aim(axis, normal, self.tilt, place)}
 
     @property
     def camera_model(self) -> AbstractCamera:
@@ -85,7 +85,7 @@ class SimulatedPixels(AbstractSimulated):
         return self.scale * self.points.mean(axis=0)
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
-        count, turn = _TRIED * self.poses, np.asarray(rotation_matrix(self.frame[:3]))
+        count, turn = self.spares * self.poses, np.asarray(rotation_matrix(self.frame[:3]))
         if self.on_arm:
             spread = _ASIDE * np.ptp(self.points, axis=0) * random.uniform(-1, 1, (count, 3))
             spread[:, 2] += random.uniform(-0.5, 0.5, count) * np.ptp(self.distance)
@@ -122,6 +122,9 @@ class SimulatedPixels(AbstractSimulated):
             image_size=self.image_size,
             u_scale=self.u_scale,
         )
+
+    def measurable(self, transforms: Transforms) -> Bool[np.ndarray, " m"]:
+        return self._seen(transforms)[0]
 
     def _seen(self, transforms: Transforms) -> tuple[Bool[np.ndarray, " m"], Float[np.ndarray, "m k d"]]:
         """Which poses have the whole target in view, and its corners."""
