@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from ..core.distributions import chance
 from ..core.text import common_labels
-from ..uncertainty.between_groups import BetweenGroups
+from ..uncertainty.between_groups import BetweenGroups, more_uncertain
 
 SIGNIFICANCE = 0.01  # probability below which errors beyond their prediction are not put down to chance
 _HALF = SIGNIFICANCE / 2  # for single groups of a cross-validation; the other half is for all of them together
@@ -26,21 +26,25 @@ class Agreement(NamedTuple):
     reduced_chi: float = math.nan  # root mean square of a residual in standard deviations of the noise alone
     rms_angle: float = math.nan  # of residuals in rad, where there are any
     rms_px: float = math.nan  # in px
+    between: BetweenGroups | None = None  # how errors of groups scatter about such a prediction
 
     @property
     def probability(self) -> float:
         """Of at least such a sum of squares by chance where the prediction is right; NaN where nothing is predicted."""
-        return chance(self.rms, self.predicted, self.degrees_of_freedom, self.noise_degrees_of_freedom)
+
+        def given(of_errors: float, of_prediction: float) -> float:
+            freedom = more_uncertain(self.degrees_of_freedom, of_errors)
+            return chance(
+                self.rms, self.predicted, freedom, more_uncertain(self.noise_degrees_of_freedom, of_prediction)
+            )
+
+        return given(0.0, 0.0) if self.between is None else self.between.probability(given)
 
     def by_groups(self, between: BetweenGroups | None) -> "Agreement":
         """The same, predicted as groups that were held out have shown; as it is where there were none."""
         if between is None or not self.degrees_of_freedom > 0:
             return self
-        return self._replace(
-            predicted=self.predicted * math.sqrt(between.ratio),
-            degrees_of_freedom=between.scatter(self.degrees_of_freedom),
-            noise_degrees_of_freedom=between.certainty(self.noise_degrees_of_freedom),
-        )
+        return self._replace(predicted=self.predicted * math.sqrt(between.ratio), between=between)
 
 
 NOTHING = Agreement(0, math.nan, math.nan, math.nan, math.inf)  # where there is nothing to compare
@@ -147,10 +151,12 @@ class CrossValidation(NamedTuple):
         squares = sum(group.poses * getattr(group, name) ** 2 for group in counted)
         return math.sqrt(squares / sum(group.poses for group in counted)) if counted else math.nan
 
-    def between(self, without: int | None = None) -> BetweenGroups | None:
-        """How the poses of the groups agree with their prediction, or of all but one; None where there are too few."""
+    def between(self, without: int | None = None, *, chosen: bool = False) -> BetweenGroups | None:
+        """How the poses of the groups agree with their prediction, or of all but one; None where there are too few.
+        ``chosen``: whether the data chose the model."""
         groups = [group for i, group in enumerate(self.groups) if i != without]
-        return BetweenGroups.of([group.ratio for group in groups], [group.comparisons[0][3] for group in groups])
+        freedom = [group.comparisons[0][3] for group in groups]
+        return BetweenGroups.of([group.ratio for group in groups], freedom, chosen=chosen)
 
     @property
     def probabilities(self) -> list[list[float]]:
@@ -190,10 +196,13 @@ class CrossValidation(NamedTuple):
                 # A sum of squares of independent parts with means T and degrees of freedom f has
                 # (sum T)^2 / sum (T^2 / f) of them (Satterthwaite).
                 count, rms, predicted, freedom = np.array(usable).T
-                if between is not None:
-                    freedom = np.array([between.scatter(float(of_group)) for of_group in freedom])
                 means = count * predicted**2
                 ratio = math.sqrt(np.sum(count * rms**2) / means.sum())
-                pooled.append(chance(ratio, 1.0, float(means.sum() ** 2 / np.sum(means**2 / freedom)), of_noise))
+
+                def given(of_errors: float, _: float, freedom=freedom, means=means, ratio=ratio) -> float:
+                    whole = means.sum() ** 2 / np.sum(means**2 / more_uncertain(freedom, of_errors))
+                    return chance(ratio, 1.0, float(whole), of_noise)
+
+                pooled.append(given(0.0, 0.0) if between is None else between.probability(given))
         probabilities = [probability for probability in pooled if math.isfinite(probability)]
         return bool(self.disagreeing) or any(probability < _HALF / len(probabilities) for probability in probabilities)

@@ -315,7 +315,8 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
         covariance, is_open, names = np.asarray(result.covariance), np.asarray(result.open), result.names
         u_k, surplus_k = None if np.isnan(result.u_k) else np.asarray(result.u_k), np.asarray(result.surplus_k)
         lengths = len(result.recording.capture.lengths)
-        between = None if result.validation is None else result.validation.between()
+        chosen = result.prior is not None and any(result.prior.learned)
+        between = None if result.validation is None else result.validation.between(chosen=chosen)
     else:
         arm, scale, names = result.arm, result.scale, result.space.names
         covariance, _, is_open, noise, components = result.parameter_covariance

@@ -55,12 +55,10 @@ _MOST_OF_POSES = 0.5
 _TRUSTED = 0.1
 _FEWEST = 6  # degrees of freedom
 # Median of the standard deviation of errors of the tip that poses share, of that of the residuals, as it is expected
-# beforehand; three lengths say so little that it decides how wide intervals are (`benchmarks/NOTES.md`).
-_USUAL = 1.25
-# Probability beforehand that places err at all: even odds where several differences between lengths show them. A single
-# difference (two lengths) may as well be that of one wrong length, and says so little that with even odds U would be
-# several times too large in one sound capture of ten (`benchmarks/NOTES.md`).
-_SEVERAL, _ONE_DIFFERENCE = 0.8, 0.2
+# beforehand. Three lengths say so little that it decides how wide intervals are: a seat that shifts by several times
+# what single poses scatter is common, and a smaller scale costs coverage there (`benchmarks/NOTES.md`).
+_USUAL = 2.5
+_EVEN = 6.0  # square of the number of differences between lengths at which it is as likely as not that places err
 
 
 def amend(result: Calibration, case: Case, sensitivities: Callable[[], Sensitivities]) -> Calibration:
@@ -112,7 +110,7 @@ def _tips(
     candidates: dict[float, Float[np.ndarray, "M c"]],
     probability: float = 1.0,
 ) -> _Tips:
-    """The most likely of some patterns, with their variance; usually it is about as large as that of single poses.
+    """The most likely of some patterns, with their variance.
     ``probability``: that there are such errors, beforehand."""
     usual = _USUAL * residual_rms(problem.rows)
     fits = [one_variance(effects, problem.moved(patterns), usual, probability) for patterns in candidates.values()]
@@ -326,5 +324,14 @@ def _places(problem: SharedProblem, effects: Effects) -> _Tips | None:
     whole = float(effects.product(by_poses[:, None], by_poses[:, None])[0, 0])
     if not number or np.sum(squares / values) > _MOST_OF_POSES * whole:
         return None
-    probability = _ONE_DIFFERENCE if number == 1 else _SEVERAL
-    return _tips(problem, effects, PLACES, {np.nan: patterns}, probability)
+    return _tips(problem, effects, PLACES, {np.nan: patterns}, probability_of_places(number))
+
+
+def probability_of_places(differences: int) -> float:
+    """Probability beforehand that places err at all, where so many differences between lengths can show it.
+
+    Many differences decide by themselves. A few say so little that what is expected beforehand decides how wide U is,
+    and a single one may as well be that of a wrong length: with even odds, U would be several times too large in one
+    sound capture of ten (`benchmarks/NOTES.md`).
+    """
+    return differences**2 / (differences**2 + _EVEN)

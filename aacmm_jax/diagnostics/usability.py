@@ -8,12 +8,13 @@ import numpy as np
 
 from ..calibration.record import SCALE_REFUSED, CalibrationRecord
 from ..calibration.results import active_names
-from ..core.text import shorten
+from ..core.text import listed, shorten
 from ..kinematics.parameters import Parameters
 from .contradictions import session_metrics
 from .culprits import missing
 from .equations import EXACT
 from .findings import Case, Finding, findings_of
+from .joint_travel import standing_rows
 from .mistakes import mistake_in_data
 from .noisy_encoders import noisiest_joint
 from .pose_residuals import distances_of
@@ -26,12 +27,33 @@ _MOST, _FEW = 0.5, 0.05  # part of the squared residuals that a few poses have, 
 
 def test(case: Case) -> list[Finding]:
     """A solve that did not end, and residuals that no arm has."""
-    record, findings = case.record, []
+    record, findings = case.record, _standing(case.record)
     if not record.converged and not record.reason.startswith(SCALE_REFUSED):  # that is said by another finding
         findings.append(Finding("not-converged", record.reason, severity="unusable"))
     if record.residual > record.largest_usual_residual:
         findings.append(_of_residuals(case))
     return findings
+
+
+def _standing(record: CalibrationRecord) -> list[Finding]:
+    """Joints that hardly moved, where that leaves free parameters undetermined for which there is no prior."""
+    nominal = record.recording.nominal
+    rows = [] if record.prior is not None else standing_rows(nominal.arm, record.recording.capture)
+    rows = [row for row in rows if not set(row["lost"]).isdisjoint(record.names)]
+    if not rows:
+        return []
+    joints = f"{'joint' if len(rows) == 1 else 'joints'} {listed([str(row['joint']) for row in rows])}"
+    lost = [name for row in rows for name in row["lost"] if name in record.names]
+    return [
+        Finding(
+            "standing-joints",
+            f"{joints.capitalize()} hardly moved in these poses, so that {shorten(lost, 6)} cannot be identified.",
+            advice="Let every joint move over most of its travel, or hold these parameters (--held).",
+            severity="doubt" if record.converged else "unusable",
+            doubt=f"{joints} hardly moved",
+            concerns=tuple(f"joint {row['joint']}" for row in rows),
+        )
+    ]
 
 
 def _of_residuals(case: Case) -> Finding:

@@ -57,7 +57,7 @@ class Uncertainty(eqx.Module):
     # What an evaluation keeps of the geometry that the calibration found; None: everything is fitted.
     kept: KeptGeometry | None = eqx.field(default=None, kw_only=True)
     # How poses of groups that were held out agree with their prediction; None: no groups were.
-    between: BetweenGroups | None = eqx.field(static=True, default=None, kw_only=True)
+    between: BetweenGroups | None = eqx.field(default=None, kw_only=True)
 
     @property
     def space(self) -> Parameters:
@@ -133,8 +133,11 @@ class Uncertainty(eqx.Module):
 
     @property
     def law(self) -> Law:
-        """How well the variances of `parts` are known."""
-        return self.scatter if self.components is None else self.scatter.joined(self.components.law)
+        """How well the variances of `parts` are known: the first elsewhere than in the groups that taught the model, if
+        the data chose it."""
+        chosen = self.between is not None and self.between.chosen
+        scatter = self.between.law(self.scatter_degrees_of_freedom) if chosen else self.scatter
+        return scatter if self.components is None else scatter.joined(self.components.law)
 
     def parts(self, derivatives: Float[AnyArray, "... p"]) -> Float[AnyArray, "... c"]:
         """Variances of quantities with these derivatives by the parameters: by the scatter, then by `components`."""

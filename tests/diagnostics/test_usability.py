@@ -101,3 +101,21 @@ def test_a_scale_that_is_not_plausible_is_not_said_to_have_converged(readings):
     assert record.reason.startswith("Not usable: the scale factor k = 0.1")
     assert [finding.code for finding in findings_of(record) if finding.severity == "unusable"] == ["implausible-scale"]
     assert why_unusable(record) == "the reference lengths give an implausible scale"
+
+
+@pytest.mark.parametrize(
+    ("moved", "says"), [((0, 1), "joints 3, 4, 5 and 6"), ((0, 1, 2, 4, 5), "joint 4"), (range(6), "")]
+)
+def test_joints_that_stand_still_are_named_first(paper_arm, moved, says):
+    random = np.random.default_rng(1)
+    q = np.full((40, 6), 0.3)
+    q[:, moved] = random.uniform(-1.5, 1.5, (40, len(moved)))
+    points = np.array(paper_arm.position(q)) + 0.01 * random.normal(size=(40, 3))
+    seen = MeasuredPoints("tracker", q + 1e-5 * random.normal(size=q.shape), points, u=0.01)
+    capture = aj.Capture({}, [], [seen])
+    recording = aj.Recording(capture, aj.files.load_specification("cheng2018-simulation", capture=capture))
+    record = aj.calibrate_capture(recording, model="dh", automatic=False, cross_validate=False, shared_errors=False)
+    first = findings_of(record)[:1]
+    assert [finding.doubt for finding in first if finding.code == "standing-joints"] == [f"{says} hardly moved"] * bool(
+        says
+    )

@@ -22,6 +22,7 @@ OTHERS = {
     "cli/result_commands.py": 1,  # ISO 14253-1:2017
     "drift/statistics.py": 3,  # power of the test of a change
     "study/finding.py": 1,  # percentile of a study
+    "data/targets.py": 2,  # size of a marker, of that of its square
     "diagnostics/joint_travel.py": 2,  # of poses that are as near to another one
     "diagnostics/recorded.py": 1,  # least improvement by another reading of a file
     "drift/results.py": 1,  # a number that rounds to 1

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 import aacmm_jax as aj
+from aacmm_jax.uncertainty.between_groups import BetweenGroups
 from aacmm_jax.uncertainty.degrees_of_freedom import (
     Components,
     Law,
@@ -109,3 +110,20 @@ def test_parts_add_up_and_factors_follow_the_largest(paper_arm):
 def test_levels_outside_their_range_are_refused():
     with pytest.raises(aj.InputError, match="level is 95"):
         coverage_factor(95, np.ones((1, 1)), Law.of(np.array([5.0])))
+
+
+@pytest.mark.parametrize(
+    ("ratios", "expected"),
+    [
+        ([1.0] * 2, 2.175),
+        ([1.0] * 3, 2.04),
+        ([1.0] * 8, 1.981),
+        ([0.5, 1.0, 2.0], 2.673),
+        ([2.0] * 8, 1.981 * math.sqrt(2)),  # errors are larger than predicted everywhere
+        ([1.0] * 8 + [10.0], 1.981),  # one contradicts all others
+    ],
+)
+def test_a_chosen_model_is_as_certain_as_groups_that_were_held_out_show(ratios, expected):
+    """Factors of u by a finer quadrature, where each group has 60 degrees of freedom and the noise 200."""
+    between = BetweenGroups.of(ratios, [60.0] * len(ratios), chosen=True)
+    assert float(coverage_factor(0.95, np.ones((1, 1)), between.law(200.0))[0]) == pytest.approx(expected, rel=0.01)
