@@ -42,6 +42,7 @@ def test_the_extras_are_those_of_the_project():
         ("matplotlib", "plot", lambda: aj.plot.arm_workspace(aj.load_arm("panda"))),
         ("jinja2", "report", lambda: aj.report.write_report("calibration.h5", "report.html")),
         ("xarray", "data", lambda: aj.study.open_study("study.h5")),
+        ("cv2", "camera", lambda: aj.camera.detect("board.png", aj.camera.Charuco(7, 5, 30.0, 22.0))),
         ("distributed", "dask", lambda: aj.study.dask_executor("tcp://127.0.0.1:1").__enter__()),
     ],
 )
@@ -58,6 +59,7 @@ def test_a_missing_extra_is_one_sentence_in_python(module, extra, use, monkeypat
     ("module", "extra", "arguments"),
     [
         ("matplotlib", "plot", ("arm", "panda", "--figure", "arm.png")),
+        ("cv2", "camera", ("target", "aruco", "--squares", "4x3", "--size-mm", "30", "-o", "board.pdf")),
         pytest.param("jinja2", "report", ("report", "c.h5", "-o", "r.html"), marks=pytest.mark.slow),
     ],
 )

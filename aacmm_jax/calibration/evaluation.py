@@ -182,7 +182,7 @@ def _evaluated(
             rms_px=xp.stack(by_unit["px"]),
             reduced_chi=xp.stack(
                 [
-                    xp.sqrt(xp.sum(white**2) / observation.pose_equations.sum())
+                    xp.sqrt(xp.sum(white**2) / float(observation.pose_equations.sum()))
                     for observation, white in zip(observed.observations, normalised, strict=True)
                 ]
             ),

@@ -61,7 +61,7 @@ class Solution(NamedTuple):
         steps = xp.where(influence.fixed[: len(names)], 0.0, linear.steps[: len(names)])
         head = xp.concatenate([xp.diag(steps), xp.zeros((len(names), height - len(names)))], axis=1)
         components = [xp.zeros((len(names), *inverse.shape[:2])) for inverse in influence.d_inverses]
-        index = np.array([space.names.index(name) for name in names])
+        index = np.array([space.names.index(name) for name in names], dtype=int)
         of_free = propagation.rows_of_functions(influence, head, components)
         return [set_at(xp.zeros((len(space.names), *rows.shape[1:])), index, rows) for rows in of_free]
 

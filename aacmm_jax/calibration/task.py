@@ -336,6 +336,7 @@ def state_at(
     errors = linear_propagation.arm_errors(point, task.observed) if isinstance(point.forward, ForwardPass) else []
     if sigma is None:
         xp, spent = namespace(z, effective), task.fitted.sum() if effective is None else effective
+        spent = spent - task.observed.apart
         degrees_of_freedom = xp.maximum(xp.asarray(task.observed.arm_equations - spent, dtype=float), 1.0)
         if task.needs_no_weights:
             squares: Any = sum(xp.sum(part.values**2) for part in point.rows)

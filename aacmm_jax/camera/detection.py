@@ -5,6 +5,7 @@ was stated, or in which two alike are seen.
 """
 
 import os
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -42,11 +43,12 @@ class Detection(NamedTuple):
 
 @checked_arguments
 def detect(
-    image: str | os.PathLike | Grey, target: AbstractTarget, *, image_size: tuple[int, ...] | None = None
+    image: str | os.PathLike | np.ndarray, target: AbstractTarget, *, image_size: tuple[int, ...] | None = None
 ) -> Detection:
     """Find the corners of a target in an image.
 
-    Corners that are hidden or outside the image are absent. A checkerboard has to be seen whole.
+    Corners that are hidden or outside the image are absent. A checkerboard has to be seen whole, and a mirrored image
+    of one cannot be told, since it is its own mirror image; markers tell both.
 
     Args:
         image: Image file, or grey levels ``(height, width)``.
@@ -100,15 +102,23 @@ def detect(
     return Detection(ids, corners, "", size, blur, note)
 
 
-def read_image(image: str | os.PathLike | Grey) -> Grey:
+def read_image(image: str | os.PathLike | np.ndarray) -> Grey:
     """Grey levels of an image as the sensor took it; a turn that the file asks viewers for is not made."""
     if isinstance(image, np.ndarray):
+        if image.ndim != 2 or image.dtype != np.uint8:
+            raise InputError(
+                f"the image is an array of shape {image.shape} and type {image.dtype}; give grey levels (height, "
+                "width) of type uint8."
+            )
         return image
     import cv2
 
-    if not os.path.isfile(image):
-        raise InputError(f"{image} does not exist; give the path of an image.")
-    data = np.fromfile(image, dtype=np.uint8)
+    content = getattr(image, "content", None)  # of a file that was read already
+    if content is None:
+        if not os.path.isfile(image):
+            raise InputError(f"{image} does not exist; give the path of an image.")
+        content = Path(image).read_bytes()
+    data = np.frombuffer(content, dtype=np.uint8)
     try:
         grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
     except cv2.error:  # such as an image of billions of pixels
@@ -119,7 +129,7 @@ def read_image(image: str | os.PathLike | Grey) -> Grey:
 
 
 @checked_arguments
-def overlay(image: str | os.PathLike | Grey, detection: Detection, *, longest: int = 800) -> bytes:
+def overlay(image: str | os.PathLike | np.ndarray, detection: Detection, *, longest: int = 800) -> bytes:
     """A picture of an image with the corners that were found in it, and their ids or why it is refused.
 
     Args:

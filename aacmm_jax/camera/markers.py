@@ -27,18 +27,18 @@ def target_markers(grey: Grey, target: AbstractTarget) -> tuple[np.ndarray, np.n
                 f"{pluralise(int(mirrored), 'marker')} of the target can be read in a mirror only: the image or the "
                 "print is mirrored"
             )
-    strangers = shorten([str(tag) for tag in np.unique(tags[~ours])])
+    strangers = _named(np.unique(tags[~ours]).tolist())
     if not ours.any():
         if strangers:
-            raise Refusal(f"another target is seen: it has the marker {strangers}, and this one {_range(known)}")
+            raise Refusal(f"another target is seen: it has {strangers}, and this one {_range(known)}")
         raise Refusal(f"no marker of the target was found{why_nothing(grey)}")
     tags, corners = tags[ours], corners[ours]
-    twice = [str(tag) for tag, count in zip(*np.unique(tags, return_counts=True), strict=True) if count > 1]
+    twice = [int(tag) for tag, count in zip(*np.unique(tags, return_counts=True), strict=True) if count > 1]
     if twice:
-        raise Refusal(f"the marker {shorten(twice)} is seen twice: there are two boards, or a reflection")
+        raise Refusal(f"two boards or a reflection: {_named(twice)} seen twice")
     tags, corners, left_out = _agreeing(target, tags, corners)
-    notes = [f"the marker {strangers} is not on the target"] if strangers else []
-    notes += [f"the marker {shorten(left_out)} is not where the target has it, and is not used"] if left_out else []
+    notes = [f"not on the target: {strangers}"] if strangers else []
+    notes += [f"not used, since not where the target has it: {_named(left_out)}"] if left_out else []
     return tags, corners, "; ".join(notes)
 
 
@@ -59,8 +59,8 @@ def _decoded(grey: Grey, target: AbstractTarget) -> tuple[Int[np.ndarray, " t"],
 
 def _agreeing(
     target: AbstractTarget, tags: Int[np.ndarray, " t"], corners: Float[np.ndarray, "t 4 2"]
-) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Markers that are where the target has them, and the names of those that are not: some background looks like one.
+) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """Markers that are where the target has them, and the ids of those that are not: some background looks like one.
 
     The one that is farthest from where the others have it is left out, until all agree.
     """
@@ -70,7 +70,7 @@ def _agreeing(
         limit = max(_FAR * float(np.median(_sides(corners[kept]))), _LEAST_FAR)
         misfit = misfits(points[kept].reshape(-1, 3), corners[kept].reshape(-1, 2)).reshape(-1, 4).max(axis=1)
         if misfit.max() <= limit:
-            return tags[kept], corners[kept], [str(tag) for tag in np.delete(tags, kept)]
+            return tags[kept], corners[kept], np.delete(tags, kept).tolist()
         if len(kept) - 1 < (1 - _MOST_LEFT_OUT) * len(tags):
             raise Refusal(
                 "the markers are not where the target has them: it is another target, or its layout is stated wrongly"
@@ -101,6 +101,12 @@ def tag_corners(
 def _sides(corners: Float[np.ndarray, "t 4 2"]) -> Float[np.ndarray, "t 4"]:
     """Lengths of the sides of markers, px."""
     return np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)
+
+
+def _named(tags: list[int]) -> str:
+    """Markers in words; nothing where there are none."""
+    word = "marker" if len(tags) == 1 else "markers"
+    return f"{word} {shorten([str(tag) for tag in tags])}" if tags else ""
 
 
 def _range(tags: Int[np.ndarray, " t"]) -> str:

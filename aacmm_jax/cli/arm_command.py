@@ -171,14 +171,15 @@ def _checked_table(specification: Any, path: Path, unit: str | None) -> dict[str
 def checked_recording(specification: Any, recording: Any, manifest: Path | None) -> dict[str, Any]:
     """What a check of a recording finds, with the lines of its manifest that correct it, where it has one."""
     from ..diagnostics.capture_check import check_capture
-    from ..files.reading_checks import compare_reading_sets, positions_unit, reading_sets_sentence
+    from ..files.reading_checks import positions_unit
+    from ..pipeline.reading_sets import compare_reading_sets, reading_sets_sentence
 
     check = with_spinner("Comparing", lambda: check_capture(specification.arm, recording.capture))
     unit = "rad" if manifest is None else None
     of_file = {"nominal": recording.nominal, "manifest": manifest}
     summary = _check_summary(specification, check, recording.capture, unit, positions_unit(manifest), **of_file)
     if manifest is not None:
-        sets = with_spinner("Calibrating", lambda: compare_reading_sets(manifest, recording))
+        sets = with_spinner("Calibrating", lambda: compare_reading_sets(recording))
         summary |= {"reading_sets": sets, "reading_sets_sentence": reading_sets_sentence(sets, check.poses)}
     return summary
 
@@ -231,7 +232,9 @@ def reading_check(summary: dict[str, Any]) -> View:
 
 
 def survey(summary: dict[str, Any]) -> View:
-    """An arm before its first calibration."""
+    """An arm before its first calibration: what to record, then why."""
+    if summary["advice"]:
+        yield summary["advice"]
     yield from views.arm(summary)
     yield from warnings_of(summary)
     rows = [
@@ -254,7 +257,6 @@ def survey(summary: dict[str, Any]) -> View:
         yield from _determined(summary)
     for arm_class in summary["needed"]:
         yield from _needed(arm_class)
-        yield f"\n{summary['advice']}"
     yield from written_of(summary)
 
 

@@ -7,17 +7,16 @@ from typing import Any, Literal
 
 import typer
 
-from .. import data, files, pipeline, plot, summaries
+from .. import files, pipeline, plot, summaries
 from ..core.errors import IdentifiabilityWarning, InputError
-from ..core.units import DEG
 from ..files.hdf5 import read_tables
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import reading, together, write_text
 from ..model.loss_names import LossName
 from ..uncertainty.coverage import LEVEL
-from . import options, views
+from . import arm_options, options, views
 from .app import command, read_with_progress, show_summary, with_spinner
-from .options import argument, flag, names_option, option, output, seed
+from .options import argument, flag, option, output, seed
 
 
 @command(
@@ -161,7 +160,7 @@ def calibrate(
     }
     chosen = pipeline.CaptureOptions(**alike)._replace(
         hold=None if hold == "none" else hold,
-        noise=_known_noise(encoder_arcsec, seating_mm, linear_encoder_mm),
+        noise=arm_options.known_noise(encoder_arcsec, seating_mm, linear_encoder_mm),
         replace_noise=not keep_noise,
         leave_out=tuple(leave_out or ()),
         hold_out=options.share_or_name(hold_out),
@@ -175,8 +174,12 @@ def calibrate(
         recording = _recording(capture, same_probe)
         recording = recording._replace(capture=recording.capture.select(only or None, without or ()))
         nominal = recording.nominal if model is None else with_model(recording.nominal, model)
-        nominal = _with_fixed_arm(nominal, held, free) if arm_fixed else _with_parameters(nominal, held, free)
-        nominal = _bounded(nominal, length_bound_mm, angle_bound_deg, bound or [])
+        nominal = (
+            arm_options.with_fixed_arm(nominal, held, free)
+            if arm_fixed
+            else arm_options.with_parameters(nominal, held, free)
+        )
+        nominal = arm_options.bounded(nominal, length_bound_mm, angle_bound_deg, bound or [])
         if prior is not None:
             chosen = chosen._replace(prior=prior_of_text(prior, nominal.arm))
         record = calibrate_capture(recording._replace(nominal=nominal), **chosen._asdict())
@@ -209,57 +212,6 @@ def _recording(paths: Sequence[Path], same_probe: bool) -> Any:
             )
         sessions[path.stem] = recording
     return pipeline.join_recordings(sessions, same_probe=same_probe)
-
-
-def _with_parameters(nominal: Any, held: str | None, free: str | None) -> Any:
-    """The arm with the parameters that the command line fixes and frees; what is freed there, its file may fix."""
-    if held is None and free is None:
-        return nominal
-    freed = names_option(free or "")
-    fixed = nominal.held if held is None else names_option(held)
-    if fixed is not None and held is None:
-        fixed = tuple(name for name in fixed if name not in freed)
-    freed = [*(name for name in nominal.free if name not in (fixed or ())), *freed]
-    return nominal._replace(held=fixed, free=tuple(dict.fromkeys(freed)), stated=tuple({*nominal.stated, "parameters"}))
-
-
-def _with_fixed_arm(nominal: Any, held: str | None, free: str | None) -> Any:
-    """The arm without a parameter to identify."""
-    from ..kinematics.arm import parameter_names
-
-    if held is not None or free is not None:
-        raise InputError("--arm-fixed holds all parameters; leave out --held and --free.")
-    return nominal._replace(
-        held=tuple(parameter_names(nominal.arm)), free=(), override={}, stated=tuple({*nominal.stated, "parameters"})
-    )
-
-
-def _bounded(nominal: Any, length_mm: float | None, angle_deg: float | None, bounds: Sequence[str]) -> Any:
-    """The arm with the bounds of its parameters, as its file or the command line says."""
-    from ..kinematics.arm import is_length
-
-    widths = options.numbers_by_name("--bound", bounds, "NAME=WIDTH, in mm or deg", 1)
-    of_bounds = {name: width if is_length(name) else width * DEG for name, (width,) in widths.items()}
-    identified = nominal.space().names
-    by_hand = bool(bounds) or length_mm is not None or angle_deg is not None
-    return nominal._replace(
-        stated=tuple({*nominal.stated, "bounds"}) if by_hand else nominal.stated,
-        length=nominal.length if length_mm is None else length_mm,
-        angle=nominal.angle if angle_deg is None else angle_deg * DEG,
-        override={name: width for name, width in nominal.override.items() if name in identified} | of_bounds,
-    )
-
-
-def _known_noise(encoder_arcsec: float | None, seating_mm: float | None, linear_encoder_mm: float | None) -> Any:
-    """The noise that is known: encoders and seat, or None."""
-    if encoder_arcsec is None and seating_mm is None and linear_encoder_mm is None:
-        return None
-    if encoder_arcsec is None or seating_mm is None:
-        missing = "--seating-mm" if seating_mm is None else "--encoder-arcsec"
-        raise InputError(
-            f"{missing} is missing; give both standard deviations, or leave out both to have them estimated."
-        )
-    return data.Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm)
 
 
 @command(
@@ -316,7 +268,7 @@ def compare_models(
     part, nominal = recording.capture.select(only or None, without or ()), recording.nominal
     if only_poses is not None:
         part = draw_poses(part, only_poses, seed)
-    noise = _known_noise(encoder_arcsec, seating_mm, linear_encoder_mm)
+    noise = arm_options.known_noise(encoder_arcsec, seating_mm, linear_encoder_mm)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", IdentifiabilityWarning)
         compared = with_spinner("Comparing models", lambda: run(

@@ -4,9 +4,8 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
-from ..camera.printing import bar_length, board_pdf
+from .. import camera
 from ..core.errors import InputError
-from ..data.targets import AbstractTarget, Charuco, Checkerboard, TagGrid, keys_of_target
 from ..files.outputs import together, write_atomically
 from ..summaries.tables import View
 from . import options
@@ -43,6 +42,9 @@ def target(
     Below the board is a bar to measure with callipers, since printers stretch the paper. The command prints the lines
     that a manifest needs.
     """
+    from ..camera.printing import bar_length
+    from ..data.targets import keys_of_target
+
     with together(output):
         columns, cross, rows = squares.lower().partition("x")
         if not (cross and columns.isascii() and columns.isdecimal() and rows.isascii() and rows.isdecimal()):
@@ -52,36 +54,36 @@ def target(
                 raise InputError(f"--{name}-mm does not apply to {kind}; leave it out.")
         board = _board(kind, int(columns[:6]), int(rows[:6]), size_mm, marker_mm or gap_mm, dictionary)
         with write_atomically(output) as temporary:
-            temporary.write_bytes(board_pdf(board, paper))
+            temporary.write_bytes(camera.board_pdf(board, paper))
         summary = {
             "written": str(output),
             "target": keys_of_target(board),
             "corners": len(board.ids),
             "bar_mm": bar_length(board),
-            "manifest": manifest_lines(board),
+            "manifest": _manifest_lines(keys_of_target(board), bar_length(board)),
         }
     show_summary(summary, as_json, _view)
 
 
-def _board(
-    kind: str, columns: int, rows: int, size: float, inner: float | None, dictionary: str | None
-) -> AbstractTarget:
+def _board(kind: str, columns: int, rows: int, size: float, inner: float | None, dictionary: str | None) -> Any:
     """The board; ``inner`` is the side of its markers, or the gap between tags, mm."""
     if kind == "checkerboard":
-        return Checkerboard(columns, rows, size)
+        return camera.Checkerboard(columns, rows, size)
     name = dictionary or _DICTIONARIES[kind]
     if kind == "charuco":
-        return Charuco(columns, rows, size, inner or round(_MARKER * size, 1), name)
-    return TagGrid(columns, rows, size, inner or round(_GAP * size, 1), name)
+        return camera.Charuco(columns, rows, size, inner or round(_MARKER * size, 1), name)
+    return camera.TagGrid(columns, rows, size, inner or round(_GAP * size, 1), name)
 
 
-def manifest_lines(board: AbstractTarget) -> list[str]:
+def _manifest_lines(keys: dict[str, Any], bar: float) -> list[str]:
     """The table of a board in a manifest (TOML)."""
-    keys = {"name": "board"} | keys_of_target(board)
     # Numbers, texts and lists of numbers are the same in JSON and TOML.
-    lines = ["[[target]]", *(f"{key} = {json.dumps(value)}" for key, value in keys.items())]
-    bar = f"{{ nominal = {bar_length(board):g}, measured = {bar_length(board):g}, u = 0.05 }}"
-    return [*lines, f"bar = {bar}  # mm: put in what you measured"]
+    lines = [f"{key} = {json.dumps(value)}" for key, value in ({"name": "board"} | keys).items()]
+    return [
+        "[[target]]",
+        *lines,
+        f"bar = {{ nominal = {bar:g}, measured = {bar:g}, u = 0.05 }}  # mm: put in what you measured",
+    ]
 
 
 def _view(summary: dict[str, Any]) -> View:

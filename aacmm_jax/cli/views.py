@@ -8,10 +8,10 @@ from ..core.text import pluralise, shorten
 from ..core.units import DEG, people_read, people_read_change
 from ..summaries import result_tables as tables
 from ..summaries import tables as words
-from ..summaries.camera_tables import camera_view, images_words
+from ..summaries.camera_tables import camera_view, images_words, shown_apart
 from ..summaries.result_tables import BY_CONSTRUCTION, STAGES, listed_apart
 from ..summaries.tables import Line, Styled, Table, View, decimals_for, formatted, listed, number
-from ..uncertainty.coverage import LEVEL_IN_PERCENT, U_AT_LEVEL
+from ..uncertainty.coverage import LEVEL_IN_PERCENT
 
 _MOST_PARTS = 12  # rows of a table
 _ARMS = {stage: words for stage, words in STAGES.items() if stage != "stage1"}
@@ -145,23 +145,25 @@ def calibration(summary: dict[str, Any]) -> View:
     yield from _observations(summary)
     stages = {stage: name for stage, name in STAGES.items() if stage != "stage1" or summary["method"] != "joint"}
     fixed_scale = summary["fixed_by_one_length"]
-    if summary["nominal"]:
+    if summary["nominal"] and summary["parameters"]:
         title = "Errors in the poses used for identification [mm]"
         yield tables.metrics_table(title, summary, stages, fixed_scale=fixed_scale)
     if "truth" in summary:
         yield tables.truth_table(summary["truth"])
     apart, harmonics = listed_apart(summary["parameters"])
-    yield tables.parameter_table("Parameters", apart)
+    if apart:
+        yield tables.parameter_table("Parameters", apart)
     if harmonics:
         yield tables.harmonics_table(harmonics)
         yield "All coefficients are written with --json and by aacmm export --format csv."
-    if summary["held"]:
+    if summary["held"] and summary["parameters"]:
         yield f"Fixed at their nominal values: {', '.join(summary['held'])}."
     if summary.get("prior"):
         yield tables.prior_table(summary["prior"])
     if summary["lengths"]:
         yield lengths(summary["lengths"], fixed_scale=fixed_scale)
-    yield from _uncertainty(summary)
+    if summary["parameters"]:
+        yield from _uncertainty(summary)
     if summary.get("shared_errors"):
         yield words.shared_sentence(summary["shared_errors"])
     yield from words.written_of(summary)
@@ -186,17 +188,17 @@ def _observations(summary: dict[str, Any]) -> View:
     factor = summary["uncertainty"]["coverage_factor_geometry_95"]
     if summary["observations"]:
         yield from tables.agreement_tables(summary)
-        parts = [row for row in summary["geometry"] if not row["part"].startswith("position of ")][:_MOST_PARTS]
+        parts = [row for row in shown_apart(summary) if not row["part"].startswith("position of ")][:_MOST_PARTS]
         if parts:
             yield tables.geometry_table(parts, factor)
-        hidden = len(summary["geometry"]) - len(parts)
+        hidden = len(shown_apart(summary)) - len(parts)
         if hidden:
             yield (
                 f"--json also shows {pluralise(hidden, 'more part')} of the geometry, including the positions of the "
                 "sockets."
             )
     if summary.get("base"):
-        yield base(summary["base"], factor)
+        yield tables.base_table(summary["base"][:_MOST_PARTS], factor)
     if summary["robust"]:
         rows = summary["less_weight"]
         least = (
@@ -210,22 +212,6 @@ def _observations(summary: dict[str, Any]) -> View:
             yield tables.weights_table(summary, _MOST_PARTS)
     if "held_out_poses" in summary:
         yield from tables.held_out_tables(summary["held_out_poses"])
-
-
-def base(frames: Sequence[dict[str, Any]], factor: float) -> Table:
-    """Where the base is in each frame of known coordinates, with its expanded uncertainty."""
-    rows = []
-    for frame in frames[:_MOST_PARTS]:
-        for name, title, quantity, scale in (
-            (frame["in"], "position [mm]", "position_{}mm", 1.0),
-            ("", "rotation vector [deg]", "rotation_{}rad", 1 / DEG),
-        ):
-            expanded = [None if u is None else factor * scale * u for u in frame[quantity.format("u_")]]
-            pairs = list(zip(frame[quantity.format("")], expanded, strict=True))
-            rows.append((name, title, *(number(scale * x, decimals_for(u), rounded=True) for x, u in pairs)))
-            rows.append(("", "U", *(number(u, decimals_for(u)) for u in expanded)))
-    title = f"Pose of the base frame in each frame with known coordinates, with {U_AT_LEVEL}"
-    return listed(title, rows, ("in", "", "x", "y", "z"))
 
 
 def _uncertainty(summary: dict[str, Any]) -> View:

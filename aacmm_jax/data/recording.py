@@ -74,6 +74,20 @@ class ReadImage(NamedTuple):
     refused: str = ""
 
 
+class ReadingSet(NamedTuple):
+    """The same poses with the other readings that their tables hold: those commanded, or those measured.
+
+    Args:
+        role: "commanded" or "measured".
+        capture: The poses with these readings, rad.
+        lines: Lines of the manifest that use them.
+    """
+
+    role: str
+    capture: Capture
+    lines: tuple[str, ...] = ()
+
+
 class Recording(NamedTuple):
     """A capture with the nominal arm that recorded it and, for a simulation, the true one.
 
@@ -93,6 +107,8 @@ class Recording(NamedTuple):
         stated: What somebody stated of how it is to be read, which no search for mistakes overrules: "columns", "sign",
             "offset" and "unit" of the joint readings, "units" of measured points.
         images: What was found in each image of a target.
+        other_readings: Where its tables hold commanded and measured readings: those that the capture does not have;
+            files of captures do not keep them.
 
     Example:
         >>> recorded = aj.Recording(capture, nominal, measured="2026-01-31")
@@ -113,3 +129,4 @@ class Recording(NamedTuple):
     as_found: ArmSpecification | None = None
     stated: tuple[str, ...] = ()
     images: tuple[ReadImage, ...] = ()
+    other_readings: ReadingSet | None = None

@@ -48,7 +48,7 @@ def _of_terms(case: Case, terms: Sequence[FoundTerm], explains: float) -> Findin
     if len(events) >= _SEVERAL:
         # Of one event, all is said; of several, what they have in common: that something was not firm.
         texts = [term_text(term) for term in terms if term.term.first < 0]
-        texts.append(f"{len(events)} changes from one pose to the next, first {term_text(events[0])}")
+        texts.append(f"{len(events)} sudden changes, of which the one that explains most is {term_text(events[0])}")
     named = {term.term.follows for term in terms}
     likely = [text for text in dict.fromkeys(other.follows for term in terms for other in term.others)]
     likely = [text for text in likely if text not in named]
@@ -60,7 +60,7 @@ def _of_terms(case: Case, terms: Sequence[FoundTerm], explains: float) -> Findin
         "missing-terms",
         f"Residuals follow {shorten(texts, 3)} ({chance_text(probability)}), which the model does not describe. "
         f"Possible causes: {', '.join(causes)}{f'; try --model {model}' if model else ''}."
-        + (f" Equally likely: {shorten(likely, 3)}." if likely else ""),
+        + (f" Equally likely: {shorten(likely, 3)}." if likely and len(events) < _SEVERAL else ""),
         "The stated uncertainties include these errors as estimated from the residuals."
         if shared - {PLACES, VISITS, SUCCESSIVE}
         else "Every stated uncertainty is too small.",

@@ -223,6 +223,8 @@ def _of_joints(q: Float[np.ndarray, "M n"], arm: Arm) -> Iterator[tuple[str, Flo
     yield "the first column is that of the last joint", np.roll(q, -1, axis=1)
     yield "the last column is that of the first joint", np.roll(q, 1, axis=1)
     slides = np.array(by_joint(arm, False, True))
+    # Of servos, whose counts of a turn begin at one end, so that their zeros are the middle.
+    yield "the zeros of all joints are half a turn off", np.where(slides, q, q - np.pi)
     yield "readings are in gon, but were read as degrees", np.where(slides, q, 0.9 * q)
     largest = float(np.abs(q[:, ~slides]).max(initial=0.0))
     if 0 < largest < _TURN * DEG:

@@ -12,6 +12,7 @@ from ..core.text import shorten
 from ..kinematics.independence import SHARE_OF_BOUNDS
 from ..kinematics.parameters import Bounds, Parameters
 from ..uncertainty.identifiability import Observability, observability, rms_of_noise
+from .culprits import selection
 from .equations import Block
 from .findings import Case, Finding, by_equations
 from .mistakes import TRY_ALL, mistake_in_data
@@ -106,7 +107,7 @@ class Effect(NamedTuple):
     """What bounds do to the residuals."""
 
     gains: dict[str, float]  # parameter on a bound -> drop of the sum of squares if this bound were wider
-    share: float  # of the sum of squares that all these bounds explain
+    share: float  # of all that is explained, by bounds or causes, that these bounds explain
 
 
 @by_equations
@@ -122,7 +123,9 @@ def effect_of_bounds(case: Case) -> Effect:
     by = np.concatenate([block.shared[:, columns] for block in blocks])
     tests = Candidates.of(without, [by[:, [i]] for i in range(len(columns))]).tests(without)
     gains = {free[i]: test.gain for i, test in zip(columns, tests, strict=True)}
-    return Effect(gains, 1 - case.left.cost / max(without.cost, 1e-300))
+    # With what causes explain of the rest, whose parts add up to 1 as well.
+    left = case.left.cost / max(without.cost, 1e-300)
+    return Effect(gains, (1 - left) / max(1 - left * case.once(selection).remaining, 1e-300))
 
 
 def _without(block: Block, columns: list[int]) -> Block:

@@ -30,7 +30,8 @@ _WORDS: dict[str, tuple[str, str]] = {
     "growing arm": ("a growth of the arm from pose to pose", "an arm that warms or cools"),
 }
 # An arm that was just switched on warms up, and what it does dies away: after these parts of the capture, to 1 / e.
-_SETTLED, _SETTLING = (0.03, 0.1, 0.3), " that settles"
+_SETTLED = (0.03, 0.1, 0.3)
+_WARMS_UP = "arm, base or instrument that were still warming up"
 
 
 class MissingTerm(NamedTuple):
@@ -120,14 +121,15 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
 
     words = {name: (sought.follows, sought.cause) for name, (_, sought) in all_sought().items()} | _WORDS
     of_joints, of_tip = [], []
-    for time, how in [(order, ""), *((np.exp(-(order + 1) / (2 * part)), _SETTLING) for part in _SETTLED)]:
+    for settles in (0.0, *_SETTLED):
+        time = np.exp(-(order + 1) / (2 * settles)) if settles else order
         drifts = [
             named("drifting base", None, time[:, :, None] * np.eye(3)),
             named("growing arm", None, time[:, :, None] * tip / 1e3),  # by 1 mm a m
         ]
-        of_tip += [term._replace(follows=term.follows + how) for term in drifts]
+        of_tip += [_settling(term) for term in drifts] if settles else drifts
         drifts = [named("drifting zero", joint, time) for joint in range(1, arm.joints + 1)]
-        of_joints += [term._replace(follows=term.follows + how) for term in drifts]
+        of_joints += [_settling(term) for term in drifts] if settles else drifts
     of_joints += [named("zero", joint, np.ones_like(order), relative=True) for joint in range(1, arm.joints + 1)]
     nominal = arm.geometry if arm.corrections is None else arm.corrections.nominal
     gravity = np.asarray(DOWN if arm.gravity is None else arm.gravity)
@@ -143,3 +145,7 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
                 of_joint = values[[term.joint == joint for term in terms]].T
                 of_joints.append(named(name, joint, of_joint, sought.relative))
     return [*of_joints, *of_tip]
+
+
+def _settling(drift: MissingTerm) -> MissingTerm:
+    return drift._replace(follows=f"{drift.follows} that settles", cause=_WARMS_UP)

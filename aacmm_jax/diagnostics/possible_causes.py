@@ -12,7 +12,7 @@ from .equations import PRIOR, Rows, lengths_in_solve
 from .findings import Case
 from .hypotheses import couplings, fixed_parameters, shifted_seats, steps
 from .missing_terms import MissingTerm, missing_terms
-from .residual_tests import LEVEL
+from .residual_tests import LEVEL, orthonormal
 
 _FEWEST = 6  # poses of a socket or observation whose scatter is compared with that of the others
 _MOST_GROUPS = 60
@@ -20,7 +20,7 @@ _SEVERAL = 4  # lengths, from which they are compared with each other
 _FAR = 10.0  # residual of a length over the scatter of the others, from which it stands out in any case
 _APART = 0.01  # part of a fixed parameter's effect that no free one has, below which it is redundant
 _MEASURED = {"rad": "orientations", "px": "pixels"}
-_SMALL = 1e-9  # singular value, relative to the largest
+_SMALL = 1e-9  # part of a residual that the model leaves, below which nothing is left
 
 
 class Cause(NamedTuple):
@@ -72,8 +72,7 @@ def _apart_from_free(rows: Sequence[Rows]) -> Float[np.ndarray, " e"]:
         basis = np.linalg.qr(flat[0])[0]
         stacked.append([columns - basis @ (basis.T @ columns) for columns in flat[1:]])
     shared, extra = (np.concatenate(columns) for columns in zip(*stacked, strict=True))
-    basis, sizes, _ = np.linalg.svd(shared, full_matrices=False)
-    basis = basis[:, sizes > _SMALL * sizes.max(initial=1e-300)]
+    basis = orthonormal(shared)
     left = np.linalg.norm(extra - basis @ (basis.T @ extra), axis=0)
     return left / np.maximum(np.linalg.norm(extra, axis=0), 1e-300)
 

@@ -41,7 +41,7 @@ class Residuals(NamedTuple):
         ends = np.cumsum([len(part.residual) for part in parts])
         slices = tuple(slice(end - len(part.residual), end) for part, end in zip(parts, ends, strict=True))
         values = np.concatenate([part.residual for part in parts])
-        empty = cls(slices, tuple(_orthonormal(part.private) for part in parts), np.zeros((len(values), 0)), values)
+        empty = cls(slices, tuple(orthonormal(part.private) for part in parts), np.zeros((len(values), 0)), values)
         empty = empty._replace(values=empty.unexplained(values[:, None])[:, 0])
         return empty.extended(np.concatenate([part.shared for part in parts]))
 
@@ -64,12 +64,12 @@ class Residuals(NamedTuple):
 
     def extended(self, columns: Float[np.ndarray, "R c"]) -> "Residuals":
         """The least squares with further unknowns, whose columns are given: last in ``basis``."""
-        added = _orthonormal(self.unexplained(columns), columns)
+        added = orthonormal(self.unexplained(columns), columns)
         basis = np.concatenate([self.basis, added], axis=1)
         return self._replace(basis=basis, values=self.values - added @ (added.T @ self.values))
 
 
-def _orthonormal(columns: Float[np.ndarray, "R c"], before: Float[np.ndarray, "R c"] | None = None) -> np.ndarray:
+def orthonormal(columns: Float[np.ndarray, "R c"], before: Float[np.ndarray, "R c"] | None = None) -> np.ndarray:
     """A basis of some columns, which were those ``before`` something was taken from them."""
     lengths = np.linalg.norm(columns if before is None else before, axis=0)
     scaled = columns / np.where(lengths > 0, lengths, 1.0)

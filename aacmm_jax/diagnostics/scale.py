@@ -170,7 +170,8 @@ def _of_weak_scale(case: Case) -> Finding | None:
     """
     record, freedom = case.record, float(case.left.degrees_of_freedom) if case.testable else 0.0
     observations = record.recording.capture.observations
-    measured = any(o.fixes_scale and not o.certified for o in observations)
+    # Residuals in px do not fall where the arm is smaller.
+    measured = any(o.fixes_scale and not (o.certified and o.lengths) for o in observations)
     if measured or record.divided or record.method == REPEATABILITY or record.prior is not None:
         return None
     u = u_of_size(record)

@@ -67,6 +67,8 @@ def amend(result: Calibration, case: Case, sensitivities: Callable[[], Sensitivi
     What is left of an estimated noise is that of single poses. The covariance by the noise of all stays: where chance
     looks like shared errors, intervals do not become narrower.
     """
+    if not case.record.names:  # they are added to the covariance of parameters
+        return result
     with np.errstate(all="ignore"):
         addition = _addition(case, sensitivities)
     if addition is None:

@@ -46,6 +46,9 @@ def _of_instruments(case: Case) -> list[tuple[str, float]]:
     rows, found = case.chunks[0], []
     for name in measured:
         sizes = [part.residual.shape if part.name == name else None for part in rows]
+        squares = sum(float(np.sum(part.residual**2)) for part in rows if part.name == name)
+        if squares * _CLEAR**2 > sum(a * b for a, b in filter(None, sizes)):  # their expectation is smaller still
+            continue
         kernels = [None if size is None else np.broadcast_to(np.eye(size[1]), (*size, size[1])) for size in sizes]
         form = form_test(case.left, kernels, relative=False)
         if (1 - form.probability) * len(measured) < SURE and form.ratio * _CLEAR**2 < 1:

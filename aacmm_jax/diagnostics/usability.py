@@ -134,7 +134,7 @@ def is_anchored(record: CalibrationRecord) -> bool:
 
 def many_on_bounds(record: CalibrationRecord) -> bool:
     """Whether so many parameters are on a bound that the arm is not that of the data."""
-    return len(on_bounds(record)) >= len(record.names) / 3 and is_anchored(record)
+    return len(on_bounds(record)) >= max(len(record.names) / 3, 1) and is_anchored(record)
 
 
 def why_unusable(record: CalibrationRecord) -> str | None:

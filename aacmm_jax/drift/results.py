@@ -156,9 +156,12 @@ def _detectable(drift: Drift) -> str:
             ends[what] = [in_words(unit, end, "") for end in (min(sizes), max(sizes))]
     if not ends:
         return ""
-    every = " or ".join(f"one {what} had changed by {largest}" for what, (_, largest) in ends.items())
-    least = " and ".join(smallest for smallest, _ in ends.values())
-    return f" A change would have been seen in 95 of 100 cases if {every}; of the most certain ones, if by {least}."
+    every = " or ".join(f"any {what} had changed by {largest}" for what, (_, largest) in ends.items())
+    least = " or ".join(smallest for smallest, _ in ends.values())
+    return (
+        f" A change would have been seen in 95 of 100 cases if {every}; in the parameters that are known best, from "
+        f"{least} on."
+    )
 
 
 def _of_all(drift: Drift) -> str:

@@ -28,6 +28,7 @@ from .manifest_rows import Source, name_of, parts
 from .manifest_tables import TABLES, Length, PointsManifest, PosesManifest, Recorded
 from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
+from .reading_sets import other_readings
 from .toml import read_toml
 
 
@@ -59,7 +60,10 @@ def read_manifest(path: str | os.PathLike, *, progress: Progress = without_progr
         >>> print(aj.files.read_manifest("capture.toml").capture.sizes)
         (40,)
     """
-    return _read(path, progress)[0]
+    manifest = path if isinstance(path, InputFile) else InputFile(path)
+    recording, readings = _read(manifest, progress)
+    other = other_readings(manifest, recording, readings.header, lambda changed: _read(changed)[0])
+    return recording._replace(other_readings=other)
 
 
 def readings_of_manifest(path: str | os.PathLike) -> Readings:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.arguments import NOT_EMPTY, NotNegative, Range, checked_arguments, checked_fields
+from ..core.arguments import NotNegative, Range, checked_arguments, checked_fields
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, to_jax
@@ -54,7 +54,7 @@ class Parameters(eqx.Module):
     """
 
     base: Arm  # from which fixed parameters are taken
-    names: Annotated[tuple[str, ...], NOT_EMPTY] = eqx.field(static=True)  # of the free ones
+    names: tuple[str, ...] = eqx.field(static=True)  # of the free ones; none where only geometry is identified
 
     def __check_init__(self):
         checked_fields(self)
@@ -96,8 +96,6 @@ class Parameters(eqx.Module):
             arm = arm.replace(beta=jnp.zeros_like(arm.alpha))
         usual = [name for name in parameter_names(arm) if name in free or not name.startswith(("beta_", "gravity_"))]
         wanted = tuple(name for name in usual if name not in held)
-        if not wanted:
-            raise InputError("every parameter is held, so nothing is left to identify; hold fewer parameters.")
         return cls(base=arm, names=wanted)
 
     @classmethod
@@ -164,7 +162,7 @@ class Parameters(eqx.Module):
         kinds = {kind: getattr(arm, kind) for kind, _ in self.indices()}
         values = {kind: tools.asarray(0.0 * arm.alpha if array is None else array) for kind, array in kinds.items()}
         rows = tools.broadcast_arrays(*(values[kind][..., i] for kind, i in self.indices()))
-        vector = tools.stack(rows, axis=-1)
+        vector = tools.stack(rows, axis=-1) if rows else tools.zeros((*arm.alpha.shape[:-1], 0))
         return vector if namespace(arm) is np else to_jax(vector)
 
     def arm(self, vector: Numbers) -> Arm:

@@ -113,9 +113,8 @@ def layout_of(
     units = {name: units for parts in used for name, units in parts.items()}
     users = Counter(name for parts in used for name in parts)
     together = set(shared)
-    alone = {
-        name: number for number, parts in enumerate(used) for name in parts if users[name] == 1 and name not in together
-    }
+    own = [(number, parts) for number, parts in enumerate(used) if observations[number].eliminates]
+    alone = {name: number for number, parts in own for name in parts if users[name] == 1 and name not in together}
     # A length with one shared end says something of what is shared alone.
     half = {name for pair in ends if (pair[0] in alone) != (pair[1] in alone) for name in pair}
     alone = {name: number for name, number in alone.items() if name not in half}

@@ -19,6 +19,7 @@ from ..data.capture import Capture, check_one_capture, check_readings
 from ..data.observations.declared import is_known
 from ..data.observations.held import platform_frames, position_of
 from ..data.observations.observation import AbstractObservation, Rows, Tips, offset_of
+from ..data.observations.reduced_rows import MOVED
 from ..kinematics.arm import Arm
 from ..kinematics.chain import Geometry, JointMotion, forward_pass, joint_motion
 from ..kinematics.parameters import Parameters
@@ -26,7 +27,7 @@ from ..solver.arrow import split
 from .layout import Layout, layout_of, unknowns_of
 from .sockets import means_over_sockets
 
-_STEPS = {"mm": 1.0, "rad": 1e-3, "px": 1.0, "1": 1e-3}  # natural steps, as those of the arm's parameters
+_STEPS = {"mm": 1.0, "rad": 1e-3, "px": 1.0, "1": 1.0}  # natural steps, as those of the arm's parameters
 
 
 @pytree
@@ -94,7 +95,11 @@ class Observed:
     @cached_property
     def steps(self) -> np.ndarray:
         """Natural step of each number: 1 mm, 1 mrad."""
-        return np.array([_STEPS[unit] for units in self.blocks.values() for unit in units])
+        steps = {name: tuple(_STEPS[unit] for unit in units) for name, units in self.blocks.items()}
+        for observation in self.observations:
+            if not observation.linear:
+                steps |= observation.steps
+        return np.concatenate([steps[name] for name in self.blocks])
 
     @cached_property
     def slices(self) -> list[slice]:
@@ -111,9 +116,17 @@ class Observed:
 
     @cached_property
     def arm_equations(self) -> int:
-        """Those of them that show errors of the arm: not what is left of rows that are reduced."""
-        rest = (observation.equations for observation in self.observations)
-        return self.equations - sum(int(counts[-1].sum()) for counts in rest if counts is not None)
+        """Those of them that show errors of the arm: of rows that are reduced, the first ones."""
+        counts = [observation.equations for observation in self.observations]
+        return self.equations - sum(int(count[MOVED:].sum()) for count in counts if count is not None)
+
+    @cached_property
+    def apart(self) -> int:
+        """Unknowns that are determined without the arm: those that do not move a target as a whole, such as
+        intrinsics."""
+        used = (observation for observation in self.observations if observation.reduces)
+        names = {name for observation in used for name in observation.apart}
+        return sum(len(self.blocks[name]) for name in names)
 
     def split(self, geometry: Float[AnyArray, " g"]) -> dict[str, Float[AnyArray, " k"]]:
         """The numbers of each part."""

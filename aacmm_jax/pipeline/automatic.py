@@ -144,6 +144,37 @@ def _is_better(wider: CalibrationRecord, record: CalibrationRecord, widened: int
     return f_tail(max(before - after, 0.0) * freedom / widened / after, widened, freedom) < _BY_CHANCE
 
 
+def with_wrong_fixed_freed(record: CalibrationRecord, solve: Solve, recorded: Record) -> CalibrationRecord:
+    """The calibration with further free parameters, where nobody stated which are free, the residuals show that some
+    are fixed at a wrong value, and they are smaller by more than chance explains without that; else as it is."""
+    nominal, case = record.recording.nominal, case_of(record)
+    if "parameters" in nominal.stated or record.implausible_residual:
+        return record
+    wrong = [cause.name for cause in culprits_of(case) if cause.kind == "fixed"]
+    zeros = [cause.term.joint for cause in culprits_of(case) if cause.term is not None and cause.term.kind == "zero"]
+    wrong += [case.equations.extra[joint - 1] for joint in zeros if joint is not None]
+    if not wrong:
+        return record
+    held = tuple(name for name in nominal.space().held if name not in wrong)
+    free = (*nominal.free, *(name for name in wrong if name.startswith("beta")))
+    recording = record.recording._replace(nominal=nominal._replace(held=held, free=free))
+    try:
+        again = recorded(solve(recording), recording)
+    except InputError:
+        return record
+    if not again.converged or not _is_better(again, record, len(wrong)):
+        return record
+    found = {name: float(value_of(again.calibrated.arm, name) - value_of(nominal.arm, name)) for name in wrong}
+    texts = [
+        f"{name} ({by:+.2g} mm)" if is_length(name) else f"{name} ({by / DEG:+.2g} deg)" for name, by in found.items()
+    ]
+    says = (
+        f"Freed, since the data contradict the nominal value at which it was fixed: {shorten(texts, 4)}. The residuals "
+        f"fell from {record.observed.rms:.3g} to {again.observed.rms:.3g} mm RMS."
+    )
+    return again._replace(decisions=(*record.decisions, says))
+
+
 def without_misplaced(record: CalibrationRecord, solve: Solve, recorded: Record) -> CalibrationRecord:
     """The calibration without the poses that are wrong where most others agree with an arm (`misplaced_poses`), which
     were recorded under a wrong name, with the readings of another pose, or with a reading that is far off."""
@@ -202,7 +233,7 @@ def with_best_model(record: CalibrationRecord, solve: Solve, recorded: Record, o
     alone, where there are too few poses to hold some out, or where a wrong certified value explains most of the
     residuals: a model would only describe what that does to the arm."""
     recording, nominal = record.recording, record.recording.nominal
-    if record.observed.rms < EXACT:  # simulated without noise
+    if record.observed.rms < EXACT or not record.names:  # simulated without noise, or only geometry was identified
         return record
     case = case_of(record)
     causes, lengths = culprits_of(case), case.once(lengths_of)

@@ -28,12 +28,14 @@ from .automatic import (
     with_best_model,
     with_full_couplings,
     with_wider_bounds,
+    with_wrong_fixed_freed,
     without_contradicting,
     without_misplaced,
 )
 from .cross_validation import can_cross_validate, cross_validate
 from .data_corrections import corrected_capture, with_corrected_readings, with_prior_of_few
 from .hold_out import held_out_poses, tested, without_held_out
+from .reading_sets import with_other_readings
 from .single import CalibrationOptions, calibrate, identify
 
 _SOLVE = CalibrationOptions()
@@ -103,9 +105,9 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         remove_contradicting: leave out groups that contradict all others.
         automatic: give too few data the prior and the noise of a real arm, leave out poses that were mixed up, correct
             readings that do not match the arm where one order, signs, zeros or unit explain them, find joints that move
-            with others, widen default bounds that the fit reaches, leave out what contradicts the rest, and compare
-            models of the joints unless a model, a prior, a method or a robust loss is stated. ``decisions`` of the
-            record says what was done and why.
+            with others, widen default bounds that the fit reaches, free parameters whose fixed value the data
+            contradict, leave out what contradicts the rest, and compare models of the joints unless a model, a prior,
+            a method or a robust loss is stated. ``decisions`` of the record says what was done and why.
         max_steps: most evaluations of each solve.
         stage: called with what is done next, in words, and a function that does it, such as to show progress.
 
@@ -164,6 +166,8 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         if mistake is None or mistake.of_bounds:
             if automatic:
                 record = chosen.stage("Checking bounds", lambda: with_wider_bounds(record, solved, recorded))
+                freed = lambda: with_wrong_fixed_freed(record, solved, recorded)  # noqa: E731
+                record = chosen.stage("Checking fixed parameters", freed)
             if chosen.remove_contradicting or (automatic and chosen.robust is None):  # which bad poses do not move
                 record = chosen.stage("Comparing groups", lambda: without_contradicting(record, solved, recorded))
             if automatic and not stated:
@@ -189,6 +193,7 @@ def _with_corrected_data(
     """The calibration without poses that were mixed up, with couplings, and with the readings corrected, where the data
     do not match the arm; and how they were corrected. ``further``: whether couplings may be added to the model."""
     solved = partial(_solved, chosen)
+    record = with_other_readings(record, solved)
     record = chosen.stage("Checking poses", lambda: without_misplaced(record, solved, recorded))
     mistake = None if matches(record) else case_of(record).once(single_mistake)
     if mistake is None:

@@ -227,14 +227,14 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
         )
         if replaced is not result:
             return replaced
-    if case is not None and given.shared_errors:
+    if case is not None and given.shared_errors and bounds.space.names:
         result = shared_errors.amend(result, case, sensitivities)
     return to_jax(result)
 
 
 def _check_identifiable(capture: Capture, bounds: Bounds, prior: Prior | None, strict: bool) -> None:
     """Warn of, or with ``strict`` refuse, free parameters that these data cannot determine; not of traced values."""
-    if inside_trace() or not is_concrete(*jax.tree.leaves((capture, bounds))):
+    if not bounds.space.names or inside_trace() or not is_concrete(*jax.tree.leaves((capture, bounds))):
         return
     space = bounds.space
     stated = prior and prior.of(space.names, space.vector())

@@ -35,7 +35,7 @@ from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
 from .cameras import camera_rows, image_rows
 from .observations import capture_observations, observed_summary
 from .tables import attributes, plain, rows_of
-from .verdicts import calibration_verdict, checked_lengths
+from .verdicts import calibration_verdict, checked_lengths, geometry_verdict
 
 _CORRELATED = 0.95
 
@@ -224,6 +224,8 @@ def calibration_summary(record: CalibrationRecord, volume: VolumetricUncertainty
     verdict = calibration_verdict(
         findings, summary["uncertainty"], held_out, "truth" in summary, "held_out_poses" in summary
     )
+    if not record.names and verdict.achieved:
+        verdict = geometry_verdict(findings, summary["cameras"], summary["uncertainty"])
     return summary | {"verdict": verdict._asdict()}
 
 

@@ -43,6 +43,13 @@ def camera_view(summary: Mapping[str, Any]) -> Iterator[str | Table]:
         yield intrinsics
 
 
+def shown_apart(summary: Mapping[str, Any]) -> list[Any]:
+    """The parts of the geometry that the tables of cameras do not show."""
+    names = {name for row in summary.get("cameras") or [] for name in (row["camera"], row["target"])}
+    said = {f"{what} of {name}" for what in ("frame", "offset", "orientation", "intrinsics") for name in names}
+    return [row for row in summary["geometry"] if row["part"] not in said]
+
+
 def mounts_table(rows: Sequence[Mapping[str, Any]], factor: float) -> Table:
     """Where cameras and targets are, with U in the worst direction and about the worst axis."""
     places = {(kind, row[kind]["of"]): row[kind] for row in rows for kind in ("mount", "place")}

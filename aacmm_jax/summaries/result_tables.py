@@ -188,6 +188,22 @@ def harmonics_table(rows: Rows) -> Table:
     })  # fmt: skip
 
 
+def base_table(frames: Rows, factor: float) -> Table:
+    """Where the base is in each frame of known coordinates, with its expanded uncertainty."""
+    rows = []
+    for frame in frames:
+        for name, title, quantity, scale in (
+            (frame["in"], "position [mm]", "position_{}mm", 1.0),
+            ("", "rotation vector [deg]", "rotation_{}rad", 1 / DEG),
+        ):
+            expanded = [None if u is None else factor * scale * u for u in frame[quantity.format("u_")]]
+            pairs = list(zip(frame[quantity.format("")], expanded, strict=True))
+            rows.append((name, title, *(number(scale * x, decimals_for(u), rounded=True) for x, u in pairs)))
+            rows.append(("", "U", *(number(u, decimals_for(u)) for u in expanded)))
+    title = f"Pose of the base frame in each frame with known coordinates, with {U_AT_LEVEL}"
+    return listed(title, rows, ("in", "", "x", "y", "z"))
+
+
 def volume_table(caption: str, volume: Row) -> Table:
     """Expanded uncertainty of tips and lengths over the working volume."""
     length = f"{volume['length_mm']:g} mm length"

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from ..calibration.agreement import SIGNIFICANCE
 from ..core.text import shorten
+from ..core.units import DEG
 from ..diagnostics.findings import Finding
 from ..uncertainty.coverage import U_AT_LEVEL
 from .result_tables import BEFORE
@@ -61,6 +62,23 @@ def calibration_verdict(
     prefix = "Calibrated, in simulation" if simulated else "Calibrated"
     says = f"{prefix}: {stated}." if single_poses and not agrees else f"{prefix}: {stated}; {checked}."
     return Verdict("good" if agrees else "neutral", says)
+
+
+def geometry_verdict(
+    findings: Sequence[Finding], cameras: Sequence[Mapping[str, Any]], uncertainty: Mapping[str, Any]
+) -> Verdict:
+    """Of a calibration that held all parameters of the arm."""
+    doubts = list(dict.fromkeys(finding.doubt or _LACKING for finding in findings if finding.severity == "doubt"))
+    factor = uncertainty["coverage_factor_geometry_95"]
+    mounts = {row["mount"]["of"]: row["mount"] for row in cameras}
+    said = [
+        f"{U_AT_LEVEL} of the mount of {name} is {two_digits(factor * mount['position_u_mm'])} mm and "
+        f"{two_digits(factor * mount['rotation_u_rad'] / DEG)} deg"
+        for name, mount in mounts.items()
+        if mount["position_u_mm"] is not None and mount["rotation_u_rad"] is not None
+    ]
+    says = "; ".join(["Only the geometry was identified, with the arm as it is", *said, *doubts])
+    return Verdict("unsure" if doubts else "neutral", f"{says}.")
 
 
 def length_uncertainty(uncertainty: Mapping[str, Any]) -> str | None:

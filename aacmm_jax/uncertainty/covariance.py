@@ -51,6 +51,8 @@ def inverse_information(
     the others.
     """
     xp = namespace(information, fixed)
+    if not len(information):
+        return information, information, fixed
     free = ~fixed
     information = information + xp.diag(xp.where(fixed, 1.0 + xp.max(xp.abs(information)), 0.0))
     # Only masks and a basis come from the eigenvectors: their derivative is infinite where eigenvalues repeat.

@@ -73,7 +73,7 @@ class Observability(NamedTuple):
     @property
     def rank(self) -> int:
         """Number of independent directions that the data determine."""
-        return int(np.sum(self.singular > _RANK * max(self.singular[0], 1e-300)))
+        return int(np.sum(self.singular > _RANK * self.singular.max(initial=1e-300)))
 
     @property
     def indices(self) -> dict[str, float]:
@@ -84,7 +84,7 @@ class Observability(NamedTuple):
         al. 1994; Nahvi and Hollerbach 1996; Sun and Hollerbach 2008.
         """
         s = self.singular
-        if self.rank < len(self.names):
+        if self.rank < len(self.names) or not self.names:
             return dict.fromkeys(("O1", "O2", "O3", "O4", "O5"), 0.0)
         return {
             "O1": float(np.exp(np.mean(np.log(s))) / np.sqrt(self.poses)),
@@ -174,6 +174,9 @@ def observability(
     check_one_capture(capture)
     check_finite(arm=arm, capture=capture, noise=noise)
     check_columns(space.base, capture.columns)
+    if not space.names:  # only geometry is identified
+        nothing = np.zeros(0)
+        return Observability((), len(capture.readings), nothing, 1.0, np.zeros((0, 0)), (), (), "", ())
     arm, capture, space, noise, bounds = to_numpy((arm, capture, space, noise, bounds))
     if noise is not None:
         noise.check(arm.joints)
@@ -276,7 +279,8 @@ class _Spectrum(NamedTuple):
         # With as many rows of zeros as there are parameters all singular values and vectors are there.
         p = len(names)
         rows = np.concatenate([whitened.poses, whitened.relations, np.zeros((p, p))])
-        _, singular, vectors = np.linalg.svd(rows, full_matrices=False)
+        rows = np.linalg.qr(rows, mode="r")  # of the same singular values and vectors, and far fewer
+        _, singular, vectors = np.linalg.svd(rows)
         rank = int(np.sum(singular > _RANK * max(singular[0], 1e-300)))
         norms = np.linalg.norm(rows, axis=0)
         scale = np.where(norms > _RANK * norms.max(), norms, 1.0)  # others are rounding

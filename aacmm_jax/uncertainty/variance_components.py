@@ -20,7 +20,8 @@ from ..core.numpy_or_jax import AnyArray, namespace, scan, stop_gradient, while_
 from ..core.units import ARCSEC
 from ..data.noise import Noise, noise_of, one_arcsec
 from ..data.observations.observation import Rows
-from ..model.elimination import sums_by_component
+from ..data.observations.reduced_rows import MOVED
+from ..model.elimination import flat, sums_by_component
 from ..model.robust import bounded_square, median_square
 from ..model.rows import Whitening
 from .linear_propagation import (
@@ -69,7 +70,7 @@ def moments(
         parts.append((products(readings, readings), products(seat, seat), measured))
     plain = [list(matrices) for matrices in zip(*parts, strict=True)]  # D, T and S of each group
     white = [
-        block.white if part.basis is None else xp.where(_last(block.white), 0.0, block.white)
+        block.white if part.basis is None else xp.where(_not_moved(block.white), 0.0, block.white)
         for part, block in zip(rows, influence.blocks, strict=False)
     ]
     columns = [_Sums.of(influence, matrices, weighted=True) for matrices in plain]
@@ -169,7 +170,7 @@ def _expectation(influence: Influence, form: _Sums, column: _Sums) -> Any:
 
 
 def _outer(left: Float[AnyArray, "h r m"], right: Float[AnyArray, "h r m"]) -> Float[AnyArray, "h h"]:
-    return left.reshape(left.shape[0], -1) @ right.reshape(right.shape[0], -1).T
+    return flat(left) @ flat(right).T
 
 
 def noise_from(variances: Moments) -> Noise:
@@ -183,14 +184,14 @@ def _each(matrices: Float[AnyArray, "m r s"], vectors: Float[AnyArray, "s m"]) -
 
 
 def without_rest(rows: list[Rows]) -> list[Rows]:
-    """Rows in which those are 0 that stand for many and show nothing of the arm (`data.observations.reduced_rows`)."""
+    """Rows in which those are 0 that errors of the arm do not reach (`data.observations.reduced_rows`)."""
     xp = namespace([part.values for part in rows])
-    kept = [part.values if part.basis is None else xp.where(_last(part.values), 0.0, part.values) for part in rows]
+    kept = [part.values if part.basis is None else xp.where(_not_moved(part.values), 0.0, part.values) for part in rows]
     return [part._replace(values=values) for part, values in zip(rows, kept, strict=True)]
 
 
-def _last(values: Float[AnyArray, "r m"]) -> np.ndarray:
-    return np.broadcast_to(np.arange(len(values))[:, None] == len(values) - 1, values.shape)
+def _not_moved(values: Float[AnyArray, "r m"]) -> np.ndarray:
+    return np.broadcast_to(np.arange(len(values))[:, None] >= MOVED, values.shape)
 
 
 def scatter_of(
@@ -247,7 +248,7 @@ def robust_scatter_of(
     do not change it much."""
     xp, rows = namespace([part.values for part in rows], errors), without_rest(rows)
     constant, expected = stop_gradient((rows, errors)), stop_gradient(degrees_of_freedom)
-    lengths = [len(part.values) - (part.basis is not None) for part in rows]
+    lengths = [len(part.values) if part.basis is None else MOVED for part in rows]
     count = sum(length * part.values.shape[1] for length, part in zip(lengths, rows, strict=True))
 
     def rescale(log_sigma: Any, _: Any) -> tuple[Any, Any]:

@@ -57,13 +57,13 @@ REFUSED = {
     "mirrored charuco": (CHARUCO, lambda: mirrored(CHARUCO), "17 markers of the target can be read in a mirror only"),
     "mirrored tags": (TAGS, lambda: mirrored(TAGS), "the print is mirrored"),
     "two checkerboards": (CHECKERS, lambda: twice(CHECKERS), "two checkerboards are seen"),
-    "two boards": (CHARUCO, lambda: twice(CHARUCO), "seen twice: there are two boards, or a reflection"),
+    "two boards": (CHARUCO, lambda: twice(CHARUCO), "two boards or a reflection: markers 0, 1, 2, 3, 4 and"),
     "other charuco": (CHARUCO, lambda: scene(Charuco(6, 5, 25.0, 18.0))[0], "it is another target"),
     "charuco for tags": (TAGS, lambda: scene(CHARUCO)[0], "it is another target"),
     "tags across": (TAGS, lambda: scene(TagGrid(3, 4, 36.0, 9.0, "4x4_50"))[0], "it is another target"),
     "other gap": (TAGS, lambda: scene(TagGrid(4, 3, 36.0, 6.0, "4x4_50"))[0], "the sizes stated are not in the right"),
     "other ids": (
-        TAGS, lambda: scene(TagGrid(4, 3, 36.0, 9.0, "4x4_50", first=20))[0], "it has the marker 20, 21, 22, 23, 24 and"
+        TAGS, lambda: scene(TagGrid(4, 3, 36.0, 9.0, "4x4_50", first=20))[0], "has markers 20, 21, 22, 23, 24 and 7"
     ),
     "smaller checkerboard": (CHECKERS, lambda: scene(Checkerboard(7, 4, 22.0))[0], "no checkerboard of 8 x 5 squares"),
     "defocus": (CHECKERS, lambda: scene(CHECKERS, blur=4.0)[0], "it is out of focus: edges are blurred by 3."),
@@ -106,7 +106,7 @@ def test_a_marker_of_another_target_is_said_and_not_used():
     code = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 40, 48)
     image[410:458, 26:74] = code
     detection = detect(image, TAGS)
-    assert detection.note == "the marker 40 is not on the target"
+    assert detection.note == "not on the target: marker 40"
     assert np.abs(errors(detection, TAGS, true)).max() < 0.6
 
 
@@ -135,5 +135,6 @@ def test_what_cannot_be_recognised_is_one_sentence(tmp_path):
     (tmp_path / "text.png").write_text("no image")
     assert_refused(lambda: detect(image, Checkerboard(9, 7, 20.0)), "9 x 7 squares looks the same after half a turn")
     assert_refused(lambda: detect(image, PointTable(range(4), np.eye(4, 3))), "without a dictionary of tags")
+    assert_refused(lambda: detect(np.zeros((9, 9, 3), dtype=np.uint8), CHARUCO), "shape (9, 9, 3) and type uint8")
     assert_refused(lambda: detect(tmp_path / "none.png", CHARUCO), "does not exist")
     assert_refused(lambda: detect(tmp_path / "text.png", CHARUCO), "is not an image")

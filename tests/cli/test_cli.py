@@ -21,6 +21,7 @@ from ..conftest import EXAMPLES, command_line
 COMMANDS = (
     *("arm", "demo", "simulate", "import", "calibrate", "evaluate", "export", "correct", "show", "plan", "compare"),
     "report",
+    "target",
 )
 SIMULATE = (
     *("simulate", "cheng2018-simulation", "-o", "capture.h5", "--seed", 4),

@@ -17,6 +17,7 @@ from aacmm_jax.cli.app import app, examples
 from aacmm_jax.cli.display import display, new_console, print_table
 from aacmm_jax.cli.options import length_option
 from aacmm_jax.summaries.calibration import calibration_summary
+from aacmm_jax.summaries.result_tables import base_table
 from aacmm_jax.summaries.tables import formatted, listed, observed_words
 from tests.example_counts import example_count
 from tests.refusals import assert_refused
@@ -185,7 +186,7 @@ def test_what_was_observed_in_words(counts, words):
 def test_base_has_its_units_and_the_digits_of_its_uncertainty(capsys):
     row = {"in": "tracker", "position_mm": [507.922315, 1.0, 2.0], "position_u_mm": [0.08, 0.0031, None]}
     row |= {"rotation_rad": [0.1, 0.0, 0.0], "rotation_u_rad": [1e-3, 1e-3, 1e-3]}
-    display([views.base([row], 2.0)])
+    display([base_table([row], 2.0)])
     shown = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ["tracker", "position", "[mm]", "507.92", "1.0000", "2.0000"] in shown
     assert ["U", "0.16", "0.0062", "-"] in shown

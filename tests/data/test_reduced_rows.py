@@ -57,6 +57,7 @@ def test_weights_are_those_of_the_whole_covariance(name):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CAMERAS)
 def test_the_gradient_is_that_of_the_squares_under_jit(name):
     """The basis turns with the unknowns, but the sum of squares is that of all corners."""

@@ -104,6 +104,20 @@ def test_a_parameter_that_is_fixed_at_a_wrong_value(paper_arm, capture, method):
     assert "--free alpha_3" in first.advice
 
 
+@pytest.mark.parametrize("stated", [(), ("parameters",)])
+def test_it_is_freed_where_nobody_stated_that_it_is_fixed(paper_arm, capture, stated):
+    held = (*aj.Parameters.free_of(paper_arm).held, "alpha_3")
+    bent = paper_arm.replace(alpha_3=float(paper_arm.alpha[2]) + np.radians(0.05))
+    nominal = ArmSpecification(bent, "test", held=held, stated=stated)
+    # A stated scale anchor, so that no models are compared.
+    record = aj.calibrate_capture(aj.Recording(capture, nominal), cross_validate=False, hold="d_3")
+    assert ("alpha_3" in record.names) == (not stated)
+    assert [says.startswith("Freed") and "alpha_3 (-0.05" in says for says in record.decisions] == [True] * (not stated)
+    assert [finding.code for finding in findings_of(record) if finding.severity == "doubt"] == ["wrong-fixed"] * len(
+        stated
+    )
+
+
 def test_a_wrong_length_is_fixed(paper_arm, capture):
     held = (*aj.Parameters.free_of(paper_arm).held, "a_2")
     longer = paper_arm.replace(a_2=float(paper_arm.a[1]) + 1.0)

@@ -32,6 +32,7 @@ SIMULATED = {
         (lambda q: q[:, ::-1], "the columns are in reverse order"),
         (lambda q: np.roll(q, 1, axis=1), "the first column is that of the last joint"),
         (lambda q: np.roll(q, -1, axis=1), "the last column is that of the first joint"),
+        (lambda q: q + np.pi, "the zeros of all joints are half a turn off"),
         (lambda q: q / 0.9, "readings are in gon, but were read as degrees"),
         (np.deg2rad, "readings are in radians, but were read as degrees"),
         (np.rad2deg, "readings are in degrees, but were read as radians"),

@@ -604,7 +604,7 @@ def test_a_change_that_is_called_detectable_is_found_in_95_of_100_cases(old, noi
     """A change by that size has the noncentrality with which the test has this power."""
     first = certain(old, 0.01, noise)
     same = compare(first, first, points=20)
-    assert "No change of the arm is seen. A change would have been seen in 95 of 100 cases if one zero" in same.answer
+    assert "No change of the arm is seen. A change would have been seen in 95 of 100 cases if any zero" in same.answer
     size = dict(zip(same.joint_test.names, same.joint_test.detectable, strict=True))["theta_4"]
     test = compare(first, shifted(first, {"theta_4": size}), points=20).joint_test
     rank, freedom = test.rank, test.degrees_of_freedom

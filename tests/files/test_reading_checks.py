@@ -11,7 +11,9 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.diagnostics.reading_fit import Explanation
 from aacmm_jax.files.manifest import read_manifest
-from aacmm_jax.files.reading_checks import angles_toml, compare_reading_sets, reading_sets, reading_sets_sentence
+from aacmm_jax.files.reading_checks import angles_toml
+from aacmm_jax.files.reading_sets import reading_sets
+from aacmm_jax.pipeline.reading_sets import compare_reading_sets, reading_sets_sentence
 from tests.conftest import EXAMPLES
 
 
@@ -67,11 +69,19 @@ def manifest(folder, pattern):
     return path
 
 
+@pytest.mark.parametrize(("pattern", "other"), [("q_cmd_*", "measured"), ("q_[0-9]*", "commanded")])
+def test_a_manifest_s_recording_has_the_other_ones(both, pattern, other):
+    recording = aj.files.read_manifest(manifest(both, pattern))
+    assert recording.other_readings.role == other
+    assert recording.other_readings.capture.readings.shape == recording.capture.readings.shape
+    assert not np.array_equal(recording.other_readings.capture.readings, recording.capture.readings)
+
+
 @pytest.mark.slow
 def test_the_better_ones_are_named_with_both_figures(both):
     path = manifest(both, "q_cmd_*")
     recording = aj.files.read_manifest(path)
-    commanded, measured = compare_reading_sets(path, recording)
+    commanded, measured = compare_reading_sets(recording)
     assert [(row["role"], row["taken"]) for row in (commanded, measured)] == [("commanded", True), ("measured", False)]
     assert measured["rms_mm"] == pytest.approx(0.045, abs=0.002)
     assert commanded["rms_mm"] > 0.3
@@ -86,10 +96,11 @@ def test_the_better_ones_are_named_with_both_figures(both):
         'points = ["x", "y", "z"]} in [[points]]'
     )
     path.write_text(re.sub("^columns = .*$", line.split(" in [[")[0], path.read_text(), flags=re.MULTILINE))
-    again = compare_reading_sets(path, aj.files.read_manifest(path))
+    again = compare_reading_sets(aj.files.read_manifest(path))
     assert [row["taken"] for row in again] == [False, True]
     assert "the manifest uses the readings that fit better" in reading_sets_sentence(again, 80)
-    assert not compare_reading_sets(EXAMPLES / "simulated_robot" / "tracker.toml", recording)  # whose table has one set
+    one = aj.files.read_manifest(EXAMPLES / "simulated_robot" / "tracker.toml")  # whose table has one set
+    assert not compare_reading_sets(one)
 
 
 def test_alike_is_said():

@@ -19,6 +19,8 @@ from jaxtyping import Bool, Float
 from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray, namespace
 
+_STEPS = {"p1": 0.01, "p2": 0.01, "k1": 0.1, "k2": 1.0, "k3": 10.0, "k4": 0.1, "k5": 1.0, "k6": 10.0}
+
 
 class Projected(NamedTuple):
     """Points as a camera sees them, and the derivatives."""
@@ -41,6 +43,11 @@ class AbstractCamera(abc.ABC):
     def units(self) -> tuple[str, ...]:
         """The unit of each of the intrinsics."""
         return tuple("px" if name in ("fx", "fy", "cx", "cy") else "1" for name in self.names)
+
+    @property
+    def steps(self) -> tuple[float, ...]:
+        """A natural step of each of the intrinsics: roughly what moves a corner far from the middle by a pixel."""
+        return tuple(_STEPS.get(name, 1.0) for name in self.names)
 
     def check_count(self, count: int, where: str) -> None:
         """Raise `InputError` for a number of intrinsics that the model does not have."""

@@ -18,6 +18,10 @@ class Fisheye(AbstractLens):
     counts = (4, 8)
     largest = math.pi  # of the angle
 
+    @property
+    def steps(self) -> tuple[float, ...]:
+        return (1.0,) * 4 + (0.01,) * 4
+
     def distorted(
         self, points: Float[AnyArray, "3 ..."], coefficients: Float[AnyArray, "k ..."]
     ) -> tuple[Float[AnyArray, "2 ..."], Float[AnyArray, "2 3 ..."], list[AnyArray]]:

@@ -91,6 +91,9 @@ class AbstractObservation(Declared):
     rotates: ClassVar[bool] = False  # whether the residual depends on the rotation of the last frame
     reduces: ClassVar[bool] = False  # whether it has so many residuals a pose that they are reduced to fewer rows
     stacks: ClassVar[bool] = True  # whether it can be evaluated together with others of the kind: see `alike`
+    # Whether geometry that no other observation uses is eliminated; else it stands beside the arm's parameters, so that
+    # there is something to solve for where no parameter is free.
+    eliminates: ClassVar[bool] = True
     # Whether the residual is linear in all unknowns, with derivatives that do not depend on tips and unknowns.
     linear: ClassVar[bool] = False
     fixes_scale: bool = False  # whether it determines the scale of the arm
@@ -146,6 +149,11 @@ class AbstractObservation(Declared):
         return {getattr(self, name): part.units_of(self) for name, part in present.items()}
 
     @property
+    def steps(self) -> Mapping[str, tuple[float, ...]]:
+        """Natural steps of parts of the geometry that are not those of their units."""
+        return {}
+
+    @property
     def rows(self) -> int:
         """Number of residuals of a pose."""
         return len(self.row_units)
@@ -155,6 +163,11 @@ class AbstractObservation(Declared):
         """How many equations each row stands for, where this is not 1 for all (None): several of the last row where
         rows are reduced, none of a row that a pose lacks."""
         return None
+
+    @property
+    def apart(self) -> tuple[str, ...]:
+        """Parts of the geometry of a kind that `reduces` which do not move the target as a whole."""
+        return ()
 
     @property
     def pose_equations(self) -> Int[np.ndarray, " m"]:

@@ -15,7 +15,7 @@ from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 from ...core.rotations import cross, rotation_and_derivative, rotation_matrix
 from ..cameras.camera import AbstractCamera, camera_models
 from ..cameras.views import Corners, views_of
-from .declared import FREE, Identifiers, Part, declared, is_exact
+from .declared import FREE, Identifiers, Part, declared, is_exact, is_known
 from .hand_eye import hand_eye
 from .observation import (
     FRAME,
@@ -60,7 +60,8 @@ class Pixels(AbstractObservation):
         ['frame of board', 'orientation of webcam']
     """
 
-    kind, table, rotates, reduces, stacks = "pixels", "pixels", True, True, False
+    kind, table, rotates, reduces = "pixels", "pixels", True, True
+    stacks, eliminates = False, False
     fixes_scale = True
     derived = ("still", "unsure")
     corners: Float[AnyArray, "m c d"] = declared(
@@ -230,10 +231,19 @@ class Pixels(AbstractObservation):
         return parts
 
     @property
+    def apart(self) -> tuple[str, ...]:
+        return tuple(name for name in (self.optics, self.scale) if name in self.unknowns)
+
+    @property
+    def steps(self) -> Mapping[str, tuple[float, ...]]:
+        steps = self.camera_model.steps
+        return {self.optics: tuple(steps[i] for i in self.unsure)} if self.unsure else {}
+
+    @property
     def certified(self) -> Certified:
         values: Certified = {}
-        if self.unsure:
-            index = np.array(self.unsure)
+        index = np.array(self.unsure, dtype=int)
+        if is_known(self.u_intrinsics[index]).any():
             values[self.optics] = (self.intrinsics[index], self.u_intrinsics[index])
         if not is_exact(self.u_scale):
             values[self.scale] = (np.ones(1), namespace(self.u_scale).reshape(self.u_scale, (1,)))
@@ -276,6 +286,8 @@ class Pixels(AbstractObservation):
         origins = tips.position - xp.einsum("cpm,p->cm", axes, offset)
         place, turn, frame = hand_eye(origins, axes, turns, shifts, counted)
         parts = {self.frame: frame, self.orientation: turn, offset_of(self.target): place}
+        if self.unsure:
+            parts[self.optics] = self.intrinsics[np.array(self.unsure)]
         return parts | {name: value for name, (value, _) in self.certified_values().items()}
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
@@ -328,8 +340,7 @@ class Pixels(AbstractObservation):
     def reduced(self, rows: Rows, shift: AnyArray | None = None, weights: Any = None) -> Rows:
         xp, (m, c, d) = namespace(rows.values, self.u), self.corners.shape
         weight = xp.where(xp.asarray(self.seen)[..., None], 1 / self.u, 0.0).reshape(m, c * d)
-        own = tuple(name for name in (self.optics, self.scale) if name in rows.by_unknowns)
-        return reduced_rows(rows, weight, own, shift, weights)
+        return reduced_rows(rows, weight, self.apart, shift, weights)
 
 
 def _crossed(arms: Float[AnyArray, "3 m c"], by_shift: Float[AnyArray, "3 d m c"]) -> Float[AnyArray, "3 d m c"]:

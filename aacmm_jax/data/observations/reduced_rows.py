@@ -6,7 +6,7 @@ standard deviations, and Q an orthonormal basis of the columns of A, the rows Q^
 half the sum of squares, and the same information A^T A. What is left, |y - Q Q^T y|, is one more row, whose derivative
 is 0, so that the sum of squares is the same too. The rows are those of the Cholesky factor of the products of (A y).
 
-The arm's own errors move the pose and nothing else, so that their covariance is one of the rows Q^T y. A least squares
+The arm's own errors move the pose and nothing else, so that they reach the first rows of Q^T y alone. A least squares
 keeps weights while its unknowns move, and so Q of the weights must stay too: the weights W of Q^T y are applied as
 y + Q (W - I) Q^T y before the reduction.
 """
@@ -18,6 +18,7 @@ from ...core.linear_algebra import inverse_cholesky
 from ...core.numpy_or_jax import AnyArray, namespace
 from .observation import Rows
 
+MOVED = 6  # rows that errors of the arm reach: the first ones, since the derivatives by the pose come first
 _RIDGE = 1e-13  # of scaled products: a column that others imitate to better than its root adds nothing
 
 

@@ -1,0 +1,64 @@
+"""The command line with a camera: hand-eye calibration with the arm as it is, what is printed of it, and exports."""
+
+import json
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.core.rotations import rotation_matrix
+
+MOUNT = (60.0, -10.0, 20.0, 0.1, 0.2, 0.3)  # mm, rad
+FRAME = (np.pi, 0, 0, -700, -200, 0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A capture of a UR10e with a camera on its flange, and of one with the board there."""
+    folder = tmp_path_factory.mktemp("cameras")
+    board = aj.camera.target_of("charuco", squares=[6, 5], size=30.0, marker=22.0)
+    nominal = aj.files.load_specification("ur10e")
+    for name, on_arm, frame, mount in (
+        ("on-arm", True, FRAME, MOUNT),
+        ("fixed", False, (np.pi, 0, 0, -700, -200, 900), (0, 0, 30, 0, 0, 0)),
+    ):
+        eye = aj.data.observations.SimulatedPixels(
+            "eye", 12, "webcam", "board", board.points, (600.0, 610.0, 319.5, 239.5), (640, 480), on_arm=on_arm,
+            frame=frame, mount=mount, distance=(250, 500), u=0.2,
+        )  # fmt: skip
+        capture = aj.simulate(nominal.arm, {}, observations=[eye], seed=1)
+        aj.files.save_capture(folder / f"{name}.h5", aj.Recording(capture, nominal))
+    return folder
+
+
+def test_hand_eye_calibration(aacmm, folder, tmp_path):
+    shown = aacmm("calibrate", folder / "on-arm.h5", "-o", "c.h5", "--arm-fixed").stdout
+    for part in ("with the arm as it is", "reprojection error 0.", "at the target", "mount of webcam", "exact"):
+        assert part in " ".join(shown.split())
+    assert "Parameters" not in shown
+    (row,) = json.loads(aacmm("show", "c.h5", "--json").stdout)["cameras"]
+    mount, place = row["mount"], row["place"]
+    assert np.linalg.norm(np.subtract(mount["position_mm"], MOUNT[:3])) < 4 * mount["position_u_mm"]
+    turned = np.array(mount["matrix_mm"])[:3, :3] @ rotation_matrix(np.array(MOUNT[3:])).T
+    assert np.arccos((np.trace(turned) - 1) / 2) < 4 * mount["rotation_u_rad"]
+    assert np.linalg.norm(np.subtract(place["position_mm"], FRAME[3:])) < 4 * place["position_u_mm"]
+    assert row["reprojection_rms"] == pytest.approx(np.sqrt(2) * 0.2, rel=0.1)
+    matrix = np.array([line.split() for line in aacmm("export", "c.h5", "--format", "matrix").stdout.splitlines()[1:]])
+    np.testing.assert_allclose(matrix.astype(float), mount["matrix_mm"], rtol=1e-9, atol=1e-9)
+    assert 'link="webcam"' in aacmm("export", "c.h5", "--format", "joint-origin").stdout
+    assert "distortion_model: plumb_bob" in aacmm("export", "c.h5", "--format", "camera-info").stdout
+    assert "--frame" in aacmm("export", "c.h5", "--format", "camera-info", "--frame", "mount", expect=2).stderr
+    assert "--camera" in aacmm("export", "c.h5", "--camera", "webcam", expect=2).stderr
+
+
+def test_a_camera_that_stands_still(aacmm, folder):
+    aacmm("calibrate", folder / "fixed.h5", "-o", "c.h5", "--arm-fixed")
+    (row,) = json.loads(aacmm("show", "c.h5", "--json").stdout)["cameras"]
+    assert (row["mount"]["of"], row["place"]["of"], row["camera_on_arm"]) == ("board", "webcam", False)
+    assert np.linalg.norm(np.subtract(row["mount"]["position_mm"], (0, 0, 30))) < 4 * row["mount"]["position_u_mm"]
+    assert aacmm("export", "c.h5", "--format", "matrix", "--frame", "place").stdout.startswith("# webcam in base, mm")
+
+
+def test_nothing_but_the_arm_is_refused(aacmm, folder):
+    said = aacmm("calibrate", folder / "on-arm.h5", "-o", "c.h5", "--arm-fixed", "--free", "beta_2", expect=2).stderr
+    assert "--arm-fixed" in said
