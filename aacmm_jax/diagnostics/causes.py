@@ -118,11 +118,13 @@ def _of_values(culprits: Sequence[Culprit]) -> Finding:
 def _of_joints(culprits: Sequence[Culprit]) -> Finding:
     joints = [culprit.name for culprit in culprits]
     chance = chance_text(max(culprit.probability for culprit in culprits))
+    several = len(joints) > 1
+    encoders = "the encoders of these joints were" if several else "the encoder of this joint were"
     return Finding(
         "noisy-encoder",
-        f"Residuals are larger where the reading of {shorten(joints, 3)} moves the tip more ({chance}), as if the "
-        "encoder of this joint were noisier than the others.",
-        advice="State the noise of each joint, or look for play in this joint.",
+        f"Residuals are larger where the reading of {shorten(joints, 3)} moves the tip more ({chance}), as if "
+        f"{encoders} noisier than the others.",
+        advice=f"State the noise of each joint, or look for play in {'these joints' if several else 'this joint'}.",
         severity="doubt",
         concerns=tuple(joints),
     )

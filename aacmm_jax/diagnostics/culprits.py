@@ -21,10 +21,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..core.distributions import chi_square_tail, f_tail
-from ..core.units import ARCSEC, DEG
+from .culprit_words import Culprit, Result, in_words
 from .equations import Block, Rows, wider
-from .findings import Case, by_equations, rounded
-from .hypotheses import fixed_text, pose_names, shifted_seats, steps
+from .findings import Case, by_equations
+from .hypotheses import pose_names, shifted_seats, steps
 from .missing_terms import FoundTerm, columns_of, missing_terms
 from .possible_causes import Cause, of_certified, of_functions, of_parameters, of_variances
 from .residual_tests import LEVEL, PRESENT, SURE, Candidates, Residuals, ScoreTest, Studentised, studentised
@@ -39,25 +39,10 @@ _SECOND_ORDER = 3e-3
 # of `examples/mukca`; less is enough where the pose is also this part of all squares, which such errors are not.
 _FAR, _NEAR, _MUCH = 60.0, 25.0, 0.1
 _MOSTLY = 0.5  # part of a column that certified values and lengths see
-_ONE_JOINT = 0.9  # part of the excess of a pose that a single reading must explain to be named
 _NOTHING = 0.02  # part of all excess, below which a cause is not named
 # Of the gain of the best cause: what a step can lose where its pose is only near that of the change.
 _NEARLY, _MOST_REFINED = 0.5, 4
 _FACTORS = np.geomspace(0.1, 1e4, 32)  # of variances, in units of what they add to the mean square
-
-
-class Culprit(NamedTuple):
-    """A cause that explains residuals."""
-
-    kind: str  # "term", "fixed", "pose", "certified", "noisy joint", "scatter" or "stated u"
-    name: str  # what it concerns
-    probability: float  # Bonferroni's: of all causes of its family
-    explains: float  # of the excess of the squared residuals
-    term: FoundTerm | None = None
-    says: str = ""  # by how much
-    size: float = 0.0  # ratio of variances, of what is noisier
-    number: int = -1  # of the pose
-    others: tuple[str, ...] = ()  # causes of the same kind that explain as much
 
 
 class Selection(NamedTuple):
@@ -67,17 +52,6 @@ class Selection(NamedTuple):
     rows: list[Rows]
     relations: list[Block]
     remaining: float  # part of the sum of squares that no named cause explains
-
-
-class _Result(NamedTuple):
-    """A cause against the present model."""
-
-    cause: Cause
-    criterion: float  # twice the gain of the log likelihood, less the penalties
-    probability: float  # of all causes of its family
-    share: float  # of the sum of squares
-    test: ScoreTest | None = None
-    factor: float = 0.0  # of a variance
 
 
 def culprits_of(case: Case) -> tuple[Culprit, ...]:
@@ -118,7 +92,7 @@ class _Search:
         self.parameters = [cause for cause in parameters if cause not in self.anchor] + self.anchor
         self.noises = of_variances(case, self.rows)
         self.added: list[Callable[[], Float[np.ndarray, "R c"]]] = []  # columns of the causes that were chosen
-        self.chosen: list[tuple[_Result, list[_Result]]] = []
+        self.chosen: list[tuple[Result, list[Result]]] = []
         self.sizes: dict[str, int] = {}  # causes of each family
         self.least = _SECOND_ORDER * float(np.sqrt(case.left.cost))
         self._begin()
@@ -214,7 +188,7 @@ class _Search:
             start += len(block.residual)
         return rows, relations
 
-    def _take(self, best: _Result) -> None:
+    def _take(self, best: Result) -> None:
         """Add the best cause to the model."""
         cause = best.cause
         if cause.of_noise is None:
@@ -240,7 +214,7 @@ class _Search:
         part = float(of_cause @ of_anchor) / self._of_anchor() * lengths[number] / lengths[-1]
         return lambda: self._columns(cause) - part * self._columns(self.anchor[0])
 
-    def _results(self) -> list[_Result]:
+    def _results(self) -> list[Result]:
         """All significant causes."""
         causes = [*self.causes, *self.parameters[: len(self.parameters) - len(self.anchor)]]
         tests = [
@@ -264,9 +238,9 @@ class _Search:
         ]
         return [*results, *self._bad_poses(poses), *self._noisy(poses)]
 
-    def _at_their_poses(self, results: Sequence[_Result]) -> list[_Result]:
+    def _at_their_poses(self, results: Sequence[Result]) -> list[Result]:
         """Causes, the best first, with steps that are nearly as good at the poses where they explain most."""
-        refined: dict[tuple[str, str], _Result] = {}
+        refined: dict[tuple[str, str], Result] = {}
         near = results[0].criterion - max(_NEARLY * results[0].share * self.left.degrees_of_freedom, _AS_WELL)
         for result in results:
             term = result.cause.term
@@ -275,7 +249,7 @@ class _Search:
         steps_there = [self._at_its_pose(result) for result in list(refined.values())[:_MOST_REFINED]]
         return sorted([*results, *steps_there], key=lambda result: -result.criterion)
 
-    def _at_its_pose(self, best: _Result) -> _Result:
+    def _at_its_pose(self, best: Result) -> Result:
         """A step at the pose of all near it where it explains most."""
         term, case = best.cause.term, self.case
         assert term is not None
@@ -291,11 +265,11 @@ class _Search:
         cause, test = max(zip(causes, tests, strict=True), key=lambda pair: pair[1].gain)
         return self._of_columns(cause, test, self.sizes[cause.family])
 
-    def _of_columns(self, cause: Cause, test: ScoreTest, number: int) -> _Result:
+    def _of_columns(self, cause: Cause, test: ScoreTest, number: int) -> Result:
         share, freedom = test.gain / self.left.cost, self.left.degrees_of_freedom
         gain = -freedom * float(np.log(max(1 - share, 1e-12)))
         penalty = test.degrees_of_freedom[0] * np.log(freedom) + 2 * np.log(number)
-        return _Result(cause, gain - float(penalty), min(test.probability * number, 1.0), share, test)
+        return Result(cause, gain - float(penalty), min(test.probability * number, 1.0), share, test)
 
     def _in_relations(self) -> Bool[np.ndarray, " c"]:
         """Which functions only certified values and lengths see, as a step between two sockets: that these values are
@@ -308,7 +282,7 @@ class _Search:
         of_values = np.array([cause.kind == "certified" for cause in self.causes])
         return (below > _MOSTLY * squares) & ~of_values
 
-    def _bad_poses(self, poses: Sequence[Studentised]) -> list[_Result]:
+    def _bad_poses(self, poses: Sequence[Studentised]) -> list[Result]:
         """The pose that is farthest from what all others say of it."""
         cost, freedom, worst = self.left.cost, self.left.degrees_of_freedom, None
         for part, pose in zip(self.rows, poses, strict=True):
@@ -331,7 +305,7 @@ class _Search:
         cause = Cause("pose", "pose", self.names[number], row=number)
         return [self._of_columns(cause, test, len(self.names))]
 
-    def _noisy(self, poses: Sequence[Studentised]) -> list[_Result]:
+    def _noisy(self, poses: Sequence[Studentised]) -> list[Result]:
         """Encoders and observations that are noisier than the others."""
         u = np.concatenate([pose.values.ravel() for pose in poses])
         cost, count = float(u @ u), float(sum(pose.present.sum() for pose in poses))
@@ -358,7 +332,7 @@ class _Search:
             if probability < SURE:
                 share, penalty = 1 - np.exp(-gain / freedom), np.log(freedom) + 2 * np.log(len(self.noises))
                 factor = float(factors[best, 0])
-                results.append(_Result(cause, gain - float(penalty), probability, float(share), None, factor))
+                results.append(Result(cause, gain - float(penalty), probability, float(share), None, factor))
         return results
 
     def _culprits(self, explains: Sequence[float]) -> tuple[Culprit, ...]:
@@ -385,63 +359,5 @@ class _Search:
             if culprits and part < _NOTHING:
                 continue
             culprit = Culprit(cause.kind, cause.name, result.probability, part)
-            culprits.append(self._in_words(culprit, result, alike, coefficients.get(id(result), np.zeros(0))))
+            culprits.append(in_words(self.case, culprit, result, alike, coefficients.get(id(result), np.zeros(0))))
         return tuple(culprits)
-
-    def _in_words(
-        self, culprit: Culprit, result: _Result, alike: Sequence[_Result], coefficient: np.ndarray
-    ) -> Culprit:
-        cause = result.cause
-        if cause.kind == "pose":
-            return culprit._replace(says=self._pose_text(cause.row), number=cause.row)
-        if cause.of_noise is not None:
-            return culprit._replace(size=1 + result.factor)
-        if cause.kind == "certified":
-            names = tuple(dict.fromkeys(r.cause.name for r in alike if r.cause.kind == cause.kind))
-            return culprit._replace(others=tuple(name for name in names if name != cause.name))
-        if cause.term is None or result.test is None:
-            return culprit
-        term = cause.term
-        if cause.kind == "fixed":
-            return culprit._replace(says=fixed_text(term, float(coefficient[0])))
-        values = (term.values @ coefficient).reshape(len(term.values), -1)
-        size = abs(coefficient[0]) if term.relative else np.linalg.norm(np.ptp(values, axis=0)) / 2
-        amplitude = float(size) * (1.0 if term.joint is None else 1e-3)
-        # The same step at a neighbouring pose is no other cause.
-        others = [r.cause.term for r in alike if r.cause.term is not None]
-        others = [o for o in others if (o.kind, o.concerns) != (term.kind, term.concerns) or o.kind == "coupling"]
-        distinct = {(o.kind, o.concerns, o.correction): o for o in reversed(others)}
-        probability = result.probability
-        found = FoundTerm(term.kind, term.joint, result.test, probability, amplitude, tuple(distinct.values()), term)
-        return culprit._replace(term=found)
-
-    def _pose_text(self, number: int) -> str:
-        """How far a pose is off, and what a single reading would have to be off by to explain that."""
-        joints = self.case.record.calibrated.arm.joints
-        left = self.case.left
-        for part, rows, private in zip(self.case.chunks[0], left.slices, left.private, strict=False):
-            (place,) = np.nonzero(part.poses == number)
-            if not len(place):
-                continue
-            i = int(place[0])
-            pose = studentised(part, left, rows, private)
-            r, block = left.values[rows].reshape(part.residual.shape)[i], pose.root[i] @ pose.root[i].T
-            # The residual that the pose would have if it were left out.
-            away = float(np.linalg.norm(part.in_mm[i] @ np.linalg.pinv(block) @ r))
-            z = part.extra[i, :, :joints]
-            seen = np.maximum(np.einsum("rj,rs,sj->j", z, block, z), 1e-300)
-            gains = (r @ z) ** 2 / seen
-            worst = int(np.argmax(gains))
-            text = f"{rounded(away)} mm off"
-            explaining = gains > _ONE_JOINT * float(np.sum(pose.values[i] ** 2))
-            if explaining.sum() == 1 and away > 0:
-                slides = worst + 1 in self.case.record.calibrated.arm.prismatic
-                error = abs(float((r @ z)[worst] / seen[worst])) * (1.0 if slides else 1e-3)
-                size = f"{rounded(error)} mm" if slides else _angle(error)
-                text += f", as if the reading of joint {worst + 1} were wrong by {size}"
-            return text
-        return ""
-
-
-def _angle(error: float) -> str:
-    return f"{rounded(error / DEG)} deg" if error > 0.1 * DEG else f"{rounded(error / ARCSEC)} arcsec"

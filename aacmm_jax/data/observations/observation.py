@@ -394,7 +394,6 @@ class AbstractSimulated(Declared):
     table: ClassVar[str]  # name of its tables in the file of a kit
     poses: int
     offset: Float[np.ndarray, " 3"] | None = None  # true place of the target in the last frame, mm; None: the probe
-    spares: ClassVar[int] = 1  # random tips for each pose that is wanted, where not all poses can be measured
     aim: Aim | None = None  # from where it can be measured, if not from everywhere
 
     @abc.abstractmethod

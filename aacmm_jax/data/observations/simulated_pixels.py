@@ -14,6 +14,7 @@ from .declared import FREE, declared
 from .observation import AbstractSimulated, Aim, Readings, Transforms
 from .pixels import Pixels
 
+_TRIED, _MOST_TRIED = 10, 500  # random poses for each one that is wanted, over the share of directions within the tilt
 _ASIDE = 0.35  # of the target's size: how far from its middle the camera looks
 
 
@@ -31,7 +32,7 @@ class SimulatedPixels(AbstractSimulated):
         (10, 24, 2) ['frame of board', 'orientation of webcam']
     """  # fmt: skip
 
-    table, spares = "pixels", 25
+    table = "pixels"
     poses: int = declared("number of poses")
     camera: str = declared("camera")
     board: str = declared("target that the camera sees")
@@ -85,7 +86,8 @@ class SimulatedPixels(AbstractSimulated):
         return self.scale * self.points.mean(axis=0)
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
-        count, turn = self.spares * self.poses, np.asarray(rotation_matrix(self.frame[:3]))
+        tried = min(2 * _TRIED / (1 - np.cos(min(self.tilt, np.pi / 2)) + 1e-9), _MOST_TRIED)
+        count, turn = int(tried) * self.poses, np.asarray(rotation_matrix(self.frame[:3]))
         if self.on_arm:
             spread = _ASIDE * np.ptp(self.points, axis=0) * random.uniform(-1, 1, (count, 3))
             spread[:, 2] += random.uniform(-0.5, 0.5, count) * np.ptp(self.distance)
