@@ -147,6 +147,9 @@ def import_(
         "joints that do not move. If the tables contain both commanded and measured readings, compare them. Exit with "
         "code 1 if no order, signs, zero offsets and units make the readings fit the arm.",
     ),
+    overlays: Path | None = option(
+        "Write a picture of each image to this folder, with the corners that were found in it.", "FOLDER"
+    ),
     as_json: bool = options.JSON,
 ) -> None:
     """Read recorded joint readings into a capture."""
@@ -155,7 +158,7 @@ def import_(
             "no output file is given; give -o FILE.h5 to write a capture, or --check to check the readings only."
         )
     with together(output):
-        recording = read_with_progress(manifest)
+        recording = read_with_progress(manifest, overlays)
         summary = summaries.calibration.capture_summary(recording)
         if output is not None:
             files.save_capture(output, recording, summary)
