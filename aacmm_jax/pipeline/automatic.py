@@ -93,6 +93,7 @@ def with_wider_bounds(record: CalibrationRecord, solve: Solve, recorded: Record)
     # What a robust fit within far wider bounds shows to be needed, where residuals are large.
     fit = None if matches(record) else case_of(record).once(fitted_roughly)
     needed = {} if fit is None else beyond_bounds(fit, nominal)
+    needed = {name: change for name, change in needed.items() if name in record.names}
     for _ in range(_ROUNDS):
         reached = {*on_bounds(wider), *on_bounds(wider, final=True)}
         if not reached:
