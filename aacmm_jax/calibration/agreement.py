@@ -112,7 +112,7 @@ class CrossValidation(NamedTuple):
         >>> for group in left_out.groups:
         ...     print(group.sockets, f"{group.rms:.3f} mm, predicted {group.rms_predicted:.3f} mm")
         ('A', 'B') 0.015 mm, predicted 0.018 mm
-        ('C', 'D') 0.017 mm, predicted 0.014 mm
+        ('C', 'D') 0.017 mm, predicted 0.015 mm
     """
 
     groups: tuple[LeftOut, ...]

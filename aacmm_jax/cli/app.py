@@ -141,7 +141,7 @@ def progress_bar(*columns: Any, transient: bool = False) -> Iterator[Any]:
         yield bar
 
 
-def read_with_progress(manifest: Path) -> Any:
+def read_with_progress(manifest: Path, overlays: Path | None = None) -> Any:
     """The recording of a manifest, with a bar while images are read."""
     from ..files.manifest import read_manifest
 
@@ -150,7 +150,7 @@ def read_with_progress(manifest: Path) -> Any:
         def shown(items: Sequence[Any], what: str) -> Iterable[Any]:
             return items if bar is None else bar.track(items, description=what)
 
-        return read_manifest(manifest, progress=shown)
+        return read_manifest(manifest, progress=shown, overlays=overlays)
 
 
 def show_summary(summary: dict[str, Any], as_json: bool, view: Callable[[dict[str, Any]], Iterable]) -> None:

@@ -46,6 +46,10 @@ def simulate(
     socket: list[str] | None = option(
         "Simulate a socket at this position (mm); may be given several times.", "NAME=X,Y,Z"
     ),
+    kit: Path | None = option(
+        "Also simulate the artefacts and instruments of this kit (as for aacmm plan --kit), where it states them.",
+        "KIT.toml",
+    ),
     poses: list[str] | None = option(
         "Number of poses in each socket, or in the named socket; may be given several times. Default: 70.",
         "[NAME=]N",
@@ -106,6 +110,7 @@ def simulate(
             resolution_arcsec=(resolution_arcsec, linear_resolution_mm),
             temperature=None if warmth is None else warmth[0] if len(warmth) == 1 else list(warmth),
             acceptance=acceptance,
+            observations=[] if kit is None else [item.simulated for item in files.read_kit(kit)],
             seed=seed,
         )
         chosen = chosen._replace(poses=_poses_option(poses, points, chosen.poses)) if poses else chosen
@@ -147,6 +152,9 @@ def import_(
         "joints that do not move. If the tables contain both commanded and measured readings, compare them. Exit with "
         "code 1 if no order, signs, zero offsets and units make the readings fit the arm.",
     ),
+    overlays: Path | None = option(
+        "Write a picture of each image to this folder, with the corners that were found in it.", "FOLDER"
+    ),
     as_json: bool = options.JSON,
 ) -> None:
     """Read recorded joint readings into a capture."""
@@ -155,7 +163,7 @@ def import_(
             "no output file is given; give -o FILE.h5 to write a capture, or --check to check the readings only."
         )
     with together(output):
-        recording = read_with_progress(manifest)
+        recording = read_with_progress(manifest, overlays)
         summary = summaries.calibration.capture_summary(recording)
         if output is not None:
             files.save_capture(output, recording, summary)

@@ -167,6 +167,7 @@ def plan(
     test, it plans the poses and the positions of the artefacts.
     """
     from ..files.arm_tables import with_model
+    from ..files.kits import target_tables
     from ..files.plans import plan_csv, plan_manifest
 
     given = dict(locals())  # all options by name
@@ -194,7 +195,8 @@ def plan(
         if manifest is not None:
             # A manifest names the links with the arm; an arm file (TOML) names those of its URDF itself.
             urdf = specification.urdf if arm.lower().endswith(".urdf") else None
-            write_text(manifest, plan_manifest(planned, arm_for(manifest, arm), urdf, angles))
+            targets = () if kit is None else target_tables(kit)
+            write_text(manifest, plan_manifest(planned, arm_for(manifest, arm), urdf, angles, targets))
     written = f"{output}" if manifest is None else f"{output}, {manifest}"
     show_summary(summarise(planned, specification.name) | stated | {"written": written}, as_json, view)
 

@@ -142,4 +142,8 @@ def _far_from_stated(fit: RoughFit, nominal: ArmSpecification) -> Mistake | None
             f"the tip of the probe is {np.linalg.norm(offset):.0f} mm from where it is stated in the arm's file, near "
             f"{', '.join(f'{x:.0f}' for x in tip)} mm in the last frame"
         )
-    return Mistake(f"Likely cause: {differs} ({shorten(texts, 4)}).", tuple(far), of_bounds=set(far) <= set(free))
+    # Along the last axis, the length of the last link says the same as the probe.
+    last = f"d_{nominal.arm.joints}"
+    same = {"probe_z"} if last in free and not float(nominal.arm.alpha[-1]) else set()
+    of_bounds = set(far) <= {*free, *same}
+    return Mistake(f"Likely cause: {differs} ({shorten(texts, 4)}).", tuple(far), of_bounds=of_bounds)

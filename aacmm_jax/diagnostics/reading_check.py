@@ -175,8 +175,8 @@ def checked_fit(fit: ReadingFit) -> ReadingCheck:
     closest = min(explanations, key=lambda explanation: explanation.rms_fitted)
     explained, best, others, equal = closest.rms_fitted <= EXPLAINED * fit.size, closest, (), 0
     if explained:
-        best = min(explanations, key=lambda x: (x.outside > 0, x.changes, x.rms_fitted))
-        best = _with_common_zero(fit, best)
+        simplest = (_with_common_zero(fit, explanation) for explanation in explanations)
+        best = min(simplest, key=lambda x: (x.outside > 0, x.changes, x.rms_fitted))
         others, equal = _others(fit, best, good)
     best = best if best == given else fit.within_limits(best)
     with_tip = fit.with_tip_found(best) if evidence.own_frame else None

@@ -86,14 +86,17 @@ class Hypothesis(NamedTuple):
 
     @property
     def changes(self) -> int:
-        """Number of mistakes that it names: units, signs, exchanges of two columns, zeros."""
+        """Number of mistakes that it names: units, signs, exchanges of two columns, zeros; one zero of all joints, such
+        as the middle of servos, is one."""
         order, exchanges = list(self.order), 0
         for i in range(len(order)):
             while (j := order[i]) != i:
                 order[i], order[j] = order[j], j
                 exchanges += 1
         units = (self.angle != 1) + (self.length != 1)
-        return exchanges + units + sum(sign < 0 for sign in self.signs) + sum(offset != 0 for offset in self.offsets)
+        zeros = sum(offset != 0 for offset in self.offsets)
+        zeros = min(zeros, len(set(self.offsets))) if zeros == len(self.offsets) else zeros
+        return exchanges + units + sum(sign < 0 for sign in self.signs) + zeros
 
 
 def search(arm: Arm, evidence: Evidence, lever: float) -> tuple[list[float], list[Hypothesis], int]:

@@ -46,8 +46,9 @@ def _of_instruments(case: Case) -> list[tuple[str, float]]:
     rows, found = case.chunks[0], []
     for name in measured:
         sizes = [part.residual.shape if part.name == name else None for part in rows]
-        squares = sum(float(np.sum(part.residual**2)) for part in rows if part.name == name)
-        if squares * _CLEAR**2 > sum(a * b for a, b in filter(None, sizes)):  # their expectation is smaller still
+        of_name = [part for part in rows if part.name == name]
+        # By the stated u alone, since an observation beside it may have raised the noise of the arm.
+        if _CLEAR**2 * sum(np.sum(part.residual**2) for part in of_name) > sum(np.sum(x.measured**2) for x in of_name):
             continue
         kernels = [None if size is None else np.broadcast_to(np.eye(size[1]), (*size, size[1])) for size in sizes]
         form = form_test(case.left, kernels, relative=False)

@@ -12,7 +12,6 @@ from .calibrations import save_calibration as save_calibration
 from .captures import load_capture as load_capture
 from .captures import save_capture as save_capture
 from .cells import load_cell as load_cell
-from .cells import read_kit as read_kit
 from .comparisons import load_comparison as load_comparison
 from .comparisons import save_comparison as save_comparison
 from .controllers import dh_table as dh_table
@@ -24,6 +23,7 @@ from .evaluations import load_compared_models as load_compared_models
 from .evaluations import load_evaluation as load_evaluation
 from .evaluations import save_compared_models as save_compared_models
 from .evaluations import save_evaluation as save_evaluation
+from .kits import read_kit as read_kit
 from .manifest import read_manifest as read_manifest
 from .manifest import read_points as read_points
 from .plans import save_plan as save_plan

@@ -22,7 +22,7 @@ from ..kinematics.parameters import ArmSpecification
 from ..kinematics.workspace import Reach
 from .arms import arm_beside, for_capture, read_arm, usual_noise
 from .inputs import InputFile
-from .manifest_pixels import Cameras, Progress, observations_of, without_progress
+from .manifest_pixels import Cameras, Detecting, Progress, observations_of, without_progress
 from .manifest_readings import Readings, points_of
 from .manifest_rows import Source, name_of, parts
 from .manifest_tables import TABLES, Length, PointsManifest, PosesManifest, Recorded
@@ -31,8 +31,12 @@ from .patterns import check_fields, check_name, fields_of, fill, in_braces, matc
 from .reading_sets import other_readings
 from .toml import read_toml
 
+_QUIETLY = Detecting()
 
-def read_manifest(path: str | os.PathLike, *, progress: Progress = without_progress) -> Recording:
+
+def read_manifest(
+    path: str | os.PathLike, *, progress: Progress = without_progress, overlays: str | os.PathLike | None = None
+) -> Recording:
     """Read a manifest and every file it names, in mm and rad; paths are relative to the manifest.
 
     A field in braces matches part of a path and makes one socket for each value found: with
@@ -48,6 +52,7 @@ def read_manifest(path: str | os.PathLike, *, progress: Progress = without_progr
     Args:
         path: the manifest (TOML).
         progress: called with the names of images before they are read, and a word for what is done; yields them.
+        overlays: folder to which a picture of each image is written, with the corners that were found in it.
 
     Example:
         >>> from pathlib import Path
@@ -61,7 +66,8 @@ def read_manifest(path: str | os.PathLike, *, progress: Progress = without_progr
         (40,)
     """
     manifest = path if isinstance(path, InputFile) else InputFile(path)
-    recording, readings = _read(manifest, progress)
+    detecting = Detecting(progress, None if overlays is None else Path(overlays))
+    recording, readings = _read(manifest, detecting)
     other = other_readings(manifest, recording, readings.header, lambda changed: _read(changed)[0])
     return recording._replace(other_readings=other)
 
@@ -71,7 +77,7 @@ def readings_of_manifest(path: str | os.PathLike) -> Readings:
     return _read(path)[1]
 
 
-def _read(path: str | os.PathLike, show: Progress = without_progress) -> tuple[Recording, Readings]:
+def _read(path: str | os.PathLike, detecting: Detecting = _QUIETLY) -> tuple[Recording, Readings]:
     model = read_toml(manifest := InputFile(path), PosesManifest)
     path = as_path(path)
     with naming(path):
@@ -87,7 +93,7 @@ def _read(path: str | os.PathLike, show: Progress = without_progress) -> tuple[R
         cameras, images = Cameras(source, model.camera, model.target), list[ReadImage]()
         for entry in model.pixels:
             for values in _fields(path.parent, entry, "pixels"):
-                seen, read = observations_of(cameras, source, entry, values, show)
+                seen, read = observations_of(cameras, source, entry, values, detecting)
                 observed, images = [*observed, *seen], [*images, *read]
         for kind in TABLES:
             for entry in () if kind is Socket else getattr(model, kind.table):

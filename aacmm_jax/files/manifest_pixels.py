@@ -3,7 +3,7 @@
 import glob
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -23,6 +23,7 @@ from .manifest_cameras import CameraTable, PixelsTable, TargetTable
 from .manifest_files import as_list
 from .manifest_readings import checked_unit
 from .manifest_rows import Source, parts
+from .outputs import write_atomically
 from .patterns import fill
 from .text_table import TextTable
 
@@ -33,6 +34,13 @@ Progress = Callable[[Sequence[Any], str], Iterable[Any]]  # shows how many of th
 def without_progress(items: Sequence[Any], what: str) -> Iterable[Any]:
     """The items as they are."""
     return items
+
+
+class Detecting(NamedTuple):
+    """What is done while images are read."""
+
+    progress: Progress = without_progress
+    overlays: Path | None = None  # folder of a picture for each image, with the corners that were found in it
 
 
 class _Poses(Declared):
@@ -138,7 +146,7 @@ def by(size: Sequence[float]) -> str:
 
 
 def observations_of(
-    cameras: Cameras, source: Source, entry: PixelsTable, values: Mapping[str, str], show: Progress
+    cameras: Cameras, source: Source, entry: PixelsTable, values: Mapping[str, str], detecting: Detecting
 ) -> tuple[list[tuple[str, Pixels]], list[ReadImage]]:
     """The observations of a table, one for each session, and what was found in each image."""
     name = fill(entry.name or entry.camera, values)
@@ -147,7 +155,7 @@ def observations_of(
         target, camera = cameras.target(fill(entry.target, values)), cameras.camera(fill(entry.camera, values))
     taken = list(parts(source, _Poses, entry, values, where))
     with naming(where):
-        seen = [_checked(image, camera, target) for image in _seen(source, entry, values, target, camera, show)]
+        seen = [_checked(image, camera, target) for image in _seen(source, entry, values, target, camera, detecting)]
         read: list[ReadImage] = []
         observed: list[tuple[str, Pixels]] = []
         for part in taken:
@@ -174,13 +182,13 @@ def observations_of(
 
 def _seen(
     source: Source, entry: PixelsTable, values: Mapping[str, str], target: AbstractTarget, camera: Camera,
-    show: Progress,
+    detecting: Detecting,
 ) -> list[Seen]:  # fmt: skip
     """The corners of each image: detected, or read from a table."""
     if entry.corners is not None:
         file = source.open(fill(entry.corners, values))
         return read_corners(file, target, camera_models()[camera.model].dimension, entry.corner_columns)
-    from ..camera.detection import detect
+    from ..camera.detection import detect, overlay
 
     pattern = fill(str(entry.images), values)
     paths = [Path(path) for path in glob.glob(str(Path(glob.escape(str(source.folder))) / pattern), recursive=True)]
@@ -188,8 +196,14 @@ def _seen(
     if not names:
         raise InputError(f"no image matches '{pattern}' in {source.folder}; check the path.")
     seen = []
-    for name in show(names, "Detecting corners"):
-        found = detect(source.open(name), target, image_size=camera.image_size)
+    for name in detecting.progress(names, "Detecting corners"):
+        image = source.open(name)
+        found = detect(image, target, image_size=camera.image_size)
+        if detecting.overlays is not None:
+            detecting.overlays.mkdir(parents=True, exist_ok=True)
+            # Images of several folders may have the same name.
+            with write_atomically(detecting.overlays / f"{name.replace('/', '_')}.jpg") as path:
+                path.write_bytes(overlay(image, found))
         seen.append(Seen(name, found.ids, found.corners, found.refused, found.size))
     return seen
 

@@ -4,7 +4,7 @@ import json
 import math
 import os
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -13,9 +13,10 @@ from ..acceptance.procedure import TOUCHED, Procedure, ProcedureItem
 from ..acceptance.standards import PLANNED
 from ..core.text import csv_text
 from ..core.units import DEG
-from ..data.observations.declared import Entry
+from ..data.observations.declared import FREE, Entry
 from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation
+from ..data.observations.pixels import Pixels
 from ..kinematics.arm import by_joint
 from ..kinematics.parameters import UrdfSource
 from ..planning.design import Plan
@@ -100,7 +101,8 @@ def _kit_poses(plan: KitPlan) -> tuple[list[list[str]], np.ndarray, np.ndarray, 
         label, readings = _label(observation), np.asarray(observation.q)
         touched = [""] * len(readings) if label is None else observation.stored()[label.name]
         labels += [[observation.name, str(point)] for point in touched]
-        arm = plan.arm if simulated.offset is None else plan.arm.replace(probe=simulated.offset)
+        place = simulated.offset if simulated.aim is None else np.array(simulated.aim.place)
+        arm = plan.arm if place is None else plan.arm.replace(probe=place)
         approach = None if motion is None else motion.approach
         q.append(readings)
         tips.append(np.asarray(arm.position(readings)))
@@ -110,8 +112,9 @@ def _kit_poses(plan: KitPlan) -> tuple[list[list[str]], np.ndarray, np.ndarray, 
 
 
 def _label(observation: AbstractObservation) -> Entry | None:
-    """The entry that names what each pose was in."""
-    return next((e for e in observation.entries if e.content == "text" and e.dimensions == ("pose",)), None)
+    """The entry that names what each pose was in; None where nothing does, as of images not taken yet."""
+    texts = (e for e in observation.entries if e.content == "text" and e.dimensions == ("pose",))
+    return next((entry for entry in texts if getattr(observation, entry.name) is not None), None)
 
 
 def _file_of(procedure: Procedure, item: ProcedureItem) -> str:
@@ -133,11 +136,18 @@ _WHAT = {
 }
 
 
-def plan_manifest(plan: Planned, arm: str, urdf: UrdfSource | None = None, angles: Angles = "deg") -> str:
+def plan_manifest(
+    plan: Planned,
+    arm: str,
+    urdf: UrdfSource | None = None,
+    angles: Angles = "deg",
+    targets: Sequence[Mapping[str, Any]] = (),
+) -> str:
     """A manifest for the readings of a plan, in which the certified values are to be filled in.
 
     Files hold the joint readings in their first columns and, where something is measured, its numbers in the next;
-    readings of prismatic joints are in mm. ``urdf``: where the arm is a URDF, its links.
+    readings of prismatic joints are in mm. ``urdf``: where the arm is a URDF, its links. ``targets``: the targets of
+    cameras, as in the kit.
     """
     entries: dict[str, Any] = {"arm": arm} | ({} if urdf is None else {"base": urdf.base, "tip": urdf.tip})
     what, tables, size = _WHAT[type(plan)], [], []
@@ -147,6 +157,9 @@ def plan_manifest(plan: Planned, arm: str, urdf: UrdfSource | None = None, angle
             value = _length(round(float(length.value), 6), float(length.u))
             tables.append(("length", {"from": length.start, "to": length.end} | value))
     elif isinstance(plan, KitPlan):
+        tables += [("target", dict(target)) for target in targets]
+        cameras = {item.camera: item for item in plan.observations if isinstance(item, Pixels)}
+        tables += [("camera", _camera(item)) for item in cameras.values()]
         tables += [(item.table, _observation(item, plan.arm.joints)) for item in plan.observations]
     else:
         entries, what = entries | {"acceptance": plan.standard}, what.format(PLANNED[plan.standard])
@@ -192,8 +205,35 @@ def _of_procedure(procedure: Procedure) -> list[tuple[str, dict[str, Any]]]:
     return tables
 
 
+def _camera(observation: Pixels) -> dict[str, Any]:
+    """The table of a camera, with what was known of it for the plan."""
+    names, u = observation.camera_model.names, np.asarray(observation.u_intrinsics)
+    values = {name: round(float(x), 9) for name, x in zip(names, observation.intrinsics, strict=False)}
+    table: dict[str, Any] = {"name": observation.camera, "model": observation.model}
+    if observation.image_size is not None:
+        table["image_size"] = [int(size) for size in observation.image_size]
+    stated = {name: float(x) for name, x in zip(names, u, strict=False) if x > 0}
+    says = '"free": the intrinsics are only starts; "exact"; or standard uncertainties by name'
+    return table | {"intrinsics": values, "u": ("free" if np.any(u >= FREE) else stated or "exact", says)}
+
+
+def _images(observation: Pixels) -> dict[str, Any]:
+    """The table of images that a camera took."""
+    file = observation.name.replace("/", "-")
+    return {
+        "name": observation.name,
+        "camera": observation.camera,
+        "target": observation.board,
+        "on_arm": "camera" if observation.on_arm else "target",
+        "file": (f"{file}.csv", "one row per image, in the order of the names of the images"),
+        "images": f"{file}/*.png",
+    }
+
+
 def _observation(observation: AbstractObservation, joints: int) -> dict[str, Any]:
     """The table of one observation."""
+    if isinstance(observation, Pixels):
+        return _images(observation)
     file, stored, label = observation.name.replace("/", "-"), observation.stored(), _label(observation)
     table: dict[str, Any] = {"name": observation.name}
     if label is None:

@@ -93,6 +93,7 @@ def with_wider_bounds(record: CalibrationRecord, solve: Solve, recorded: Record)
     # What a robust fit within far wider bounds shows to be needed, where residuals are large.
     fit = None if matches(record) else case_of(record).once(fitted_roughly)
     needed = {} if fit is None else beyond_bounds(fit, nominal)
+    needed = {name: change for name, change in needed.items() if name in record.names}
     for _ in range(_ROUNDS):
         reached = {*on_bounds(wider), *on_bounds(wider, final=True)}
         if not reached:
@@ -145,13 +146,16 @@ def _is_better(wider: CalibrationRecord, record: CalibrationRecord, widened: int
 
 
 def with_wrong_fixed_freed(record: CalibrationRecord, solve: Solve, recorded: Record) -> CalibrationRecord:
-    """The calibration with further free parameters, where nobody stated which are free, the residuals show that some
-    are fixed at a wrong value, and they are smaller by more than chance explains without that; else as it is."""
+    """The calibration with further free parameters, where nobody stated which are free, a parameter that is fixed at
+    a wrong value explains most of the residuals, and these are smaller by more than chance without that; else as it
+    is."""
     nominal, case = record.recording.nominal, case_of(record)
     if "parameters" in nominal.stated or record.implausible_residual:
         return record
-    wrong = [cause.name for cause in culprits_of(case) if cause.kind == "fixed"]
-    zeros = [cause.term.joint for cause in culprits_of(case) if cause.term is not None and cause.term.kind == "zero"]
+    # Of smaller parts, errors that the model lacks take as well, and other placements are then predicted no better.
+    causes = [cause for cause in culprits_of(case) if cause.explains > _MOST]
+    wrong = [cause.name for cause in causes if cause.kind == "fixed"]
+    zeros = [cause.term.joint for cause in causes if cause.term is not None and cause.term.kind == "zero"]
     wrong += [case.equations.extra[joint - 1] for joint in zeros if joint is not None]
     if not wrong:
         return record

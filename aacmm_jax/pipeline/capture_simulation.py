@@ -12,6 +12,7 @@ from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..data.capture_data import ReferenceLength
 from ..data.noise import Noise
+from ..data.observations.observation import AbstractSimulated
 from ..data.recording import Recording
 from ..data.simulation import simulate
 from ..kinematics.parameters import ArmSpecification, perturbed_arm
@@ -37,6 +38,7 @@ class SimulationOptions(NamedTuple):
     resolution_arcsec: float | Sequence[float] = 0.0
     temperature: Numbers | None = None
     acceptance: Planned | None = None
+    observations: Sequence[AbstractSimulated] = ()
     seed: int = 0
 
 
@@ -60,6 +62,7 @@ def simulate_capture(
         temperature: of an arm with a thermometer, C, as for `simulate`.
         acceptance: instead of sockets, the acceptance test of "asme" or "iso", as `acceptance.plan_procedure` plans it
             for the nominal arm; artefacts have u = 0.001 mm.
+        observations: what else is recorded, as for `simulate`.
         seed: of the arm's errors, the poses and the noise.
 
     Returns:
@@ -77,25 +80,31 @@ def simulate_capture(
     chosen = SimulationOptions(**options)
     true = _true_arm(nominal, chosen)
     if chosen.acceptance is not None:
-        of_sockets = chosen.poses != SimulationOptions().poses, chosen.lengths, chosen.temperature is not None
+        of_sockets = (
+            bool(chosen.observations),
+            chosen.poses != SimulationOptions().poses,
+            chosen.lengths,
+            chosen.temperature is not None,
+        )
         if sockets or any(of_sockets) or np.any(chosen.resolution_arcsec):
             raise InputError(
                 "--acceptance determines the sockets, poses, lengths and temperature (20 C) itself; leave out "
-                "--socket, --poses, --length, --resolution-arcsec, --linear-resolution-mm and --temperature-c."
+                "--socket, --poses, --length, --resolution-arcsec, --linear-resolution-mm, --temperature-c and --kit."
             )
         procedure = plan_procedure(nominal.arm, chosen.acceptance)
         u = {"u_length": _U_ARTEFACT, "u_diameter": _U_ARTEFACT}
         return simulate_procedure(procedure, nominal, true, noise=chosen.noise, **u, seed=chosen.seed)
-    if not sockets:
-        raise InputError("no socket is given; give --socket NAME=X,Y,Z (sockets), or --acceptance.")
+    if not sockets and not chosen.observations:
+        raise InputError("no socket is given; give --socket NAME=X,Y,Z (sockets), --kit FILE, or --acceptance.")
     capture = simulate(
         true.arm,
-        sockets,
+        sockets or {},
         poses=chosen.poses,
         lengths=chosen.lengths,
         noise=chosen.noise,
         resolution_arcsec=chosen.resolution_arcsec,
         temperature=chosen.temperature,
+        observations=chosen.observations,
         seed=chosen.seed,
     )
     return Recording(capture, nominal, true, chosen.seed)

@@ -182,11 +182,11 @@ def _chosen(
             seat, q = thing.seat(problem.region), np.asarray(observation.q)
             starts, which = problem.near(q)
             moved, good = reached(seat, starts, np.asarray(seat.arm.position(q))[which])
-            good[good] = thing.approachable(seat, moved[good], problem.options.retract)
+            good[good] = thing.usable(problem.region, moved[good], problem.options.retract)
             rows = np.concatenate([np.arange(len(q)), which[good]])
             order = np.argsort(observation.places[rows], kind="stable")
             q = np.concatenate([q, moved[good]])[order]
-            poses.append(observation.select(rows[order]).changed(q=q))
+            poses.append(thing.recorded(problem.region, q, observation.select(rows[order])))
         return poses
 
     return best_poses(problem, pool, poses, least, lambda pool: candidates_of_kit(problem, pool), taken, near)
@@ -224,7 +224,8 @@ def _predictions(
         seat, q = thing.seat(problem.region), np.asarray(poses.q)
         starts = q + LOOSE * seat.random.normal(size=q.shape)
         moved, good = reached(seat, starts, np.asarray(seat.arm.position(q)))
-        return poses.changed(q=np.where(good[:, None], moved, q))
+        good[good] = thing.usable(problem.region, moved[good], 0.0)
+        return thing.recorded(problem.region, np.where(good[:, None], moved, q), poses)
 
     report, names = problem.options.report, [thing.item.simulated.name for thing in things]
     report("Predicting", 0.0)

@@ -18,7 +18,7 @@ from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.rotations import rotation_vector
 from ..data.capture import Capture
 from ..data.observations.observation import AbstractObservation, AbstractSimulated
-from ..kinematics.workspace import TOOL_AXIS, Cone, SearchRegion, cones_of, reached, total_link_length
+from ..kinematics.workspace import TOOL_AXIS, Cone, SearchRegion, cones_of, lowest_point, reached, total_link_length
 from ..model.observed import Observed
 from ..uncertainty.linearisation import Linearisation
 from .designs import Candidates, best_layout, relaxed_value
@@ -76,17 +76,33 @@ class Thing(NamedTuple):
 
     def seat(self, region: SearchRegion) -> SearchRegion:
         """The region of the tip that it holds, with its cone."""
-        if self.simulated.offset is not None:
-            region = region._replace(arm=region.arm.replace(probe=self.simulated.offset))
-        normal = np.asarray(self.simulated.orientation) @ np.asarray(self.item.normal, dtype=float)
+        simulated = self.simulated
+        if simulated.offset is not None:
+            region = region._replace(arm=region.arm.replace(probe=simulated.offset))
+        if simulated.aim is not None:  # a camera leads a point before it, which may be below the table
+            cone = Cone(simulated.aim.half_angle, simulated.aim.normal)
+            return region._replace(cones=cones_of([cone], simulated.aim.axis), above=-math.inf)
+        normal = np.asarray(simulated.orientation) @ np.asarray(self.item.normal, dtype=float)
         axis = TOOL_AXIS if region.cones is None else tuple(region.cones.tool_axis.tolist())
         return region._replace(cones=cones_of([Cone(self.item.half_angle, tuple(normal.tolist()))], axis))
 
-    def approachable(self, seat: SearchRegion, q: Float[np.ndarray, "c n"], retract: float) -> Bool[np.ndarray, " c"]:
-        """Which poses can be taken by way of their approach points; all where it has none."""
+    def usable(self, region: SearchRegion, q: Float[np.ndarray, "c n"], retract: float) -> Bool[np.ndarray, " c"]:
+        """Which poses, that reach it, can be measured, and taken by way of its approach points where it has these."""
+        seat, aim = self.seat(region), self.simulated.aim
+        if aim is not None:
+            on_arm = region.arm.replace(probe=np.array(aim.place))
+            return self.simulated.measurable(np.asarray(seat.arm.pose(q))) & (lowest_point(on_arm, q) >= region.above)
         if not (retract and self.item.has_cone and seat.cones is not None):
             return np.ones(len(q), dtype=bool)
         return approaches(seat, q, np.tile(seat.cones.normals, (len(q), 1)), retract)[1]
+
+    def recorded(self, region: SearchRegion, q: Float[np.ndarray, "c n"], poses: AbstractObservation | None) -> Any:
+        """Poses with these readings, as they would be recorded without errors: those of an observation, moved about
+        their tips, or measured anew where the measured values depend on how they are moved."""
+        if poses is not None and self.simulated.aim is None:
+            return poses.changed(q=q)
+        transforms = np.asarray(self.seat(region).arm.pose(q))
+        return to_numpy(self.simulated.changed(poses=len(q)).recorded(q, transforms, _without_errors()))
 
 
 class _WithoutErrors(np.random.Generator):
@@ -94,6 +110,10 @@ class _WithoutErrors(np.random.Generator):
 
     def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = None) -> Any:
         return loc + 0.0 * scale * np.zeros(() if size is None else size)
+
+
+def _without_errors() -> np.random.Generator:
+    return _WithoutErrors(np.random.PCG64(0))
 
 
 def set_up(
@@ -109,11 +129,18 @@ def set_up(
     many = simulated.changed(poses=max(starts // places, 2 * _LEAST_CANDIDATES))
     tips = many.tips(region.random)
     q, good = reached(seat, seat.draw(len(tips)), tips, scattered=True)
-    good[good] = thing.approachable(seat, q[good], retract)
+    good[good] = thing.usable(region, q[good], retract)
+    if simulated.aim is not None:
+        if np.sum(good) < max(share * many.poses, _LEAST_CANDIDATES):
+            raise InputError(
+                f"'{simulated.name}' can be measured in {np.sum(good)} of {len(good)} random poses only; move the "
+                "target or the camera, or allow other distances or tilts."
+            )
+        return thing.recorded(region, q[good], None)
     transforms = np.asarray(seat.arm.pose(q)).copy()
     transforms[:, :3, 3] = tips
     # In NumPy: every number of poses would be another program of JAX.
-    whole = to_numpy(many.recorded(q, transforms, _WithoutErrors(np.random.PCG64(0))))
+    whole = to_numpy(many.recorded(q, transforms, _without_errors()))
     counts = np.bincount(whole.places[good], minlength=int(whole.places.max()) + 1)
     tried = np.bincount(whole.places)
     if np.any(counts < np.maximum(share * tried, _LEAST_CANDIDATES)):

@@ -13,7 +13,7 @@ from ..data.recording import Recording
 from ..data.simulation import simulate
 from ..files.arms import arm_beside, load_specification
 from ..files.captures import load_capture
-from ..files.cells import read_kit
+from ..files.kits import read_kit
 from ..files.outputs import as_path, storable
 from ..files.toml import read_toml
 from ..kinematics.arm import Arm

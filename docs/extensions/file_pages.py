@@ -18,7 +18,7 @@ from key_descriptions import DESCRIPTIONS
 from pydantic import BaseModel
 
 import aacmm_jax as aj
-from aacmm_jax.files import administrative_data, arm_tables, cells, manifest_tables
+from aacmm_jax.files import administrative_data, arm_tables, cells, kits, manifest_tables
 from aacmm_jax.study import specification
 
 FOLDER = DOCS / "reference" / "files"
@@ -32,7 +32,7 @@ FORMATS: dict[str, tuple[str, str, type[BaseModel]]] = {
     "points": ("Manifest of points", "`aacmm evaluate FILE`, `aj.files.read_points`", manifest_tables.PointsManifest),
     "arm": ("Arm", "an arm of every command, `aj.load_arm`", arm_tables.ArmFile),
     "study": ("Study", "`aacmm study FILE`, `aj.study.read_study`", specification.Specification),
-    "kit": ("Kit of artefacts and instruments", "`aacmm plan --kit FILE`, `aj.files.read_kit`", cells._Kit),
+    "kit": ("Kit of artefacts and instruments", "`aacmm plan --kit FILE`, `aj.files.read_kit`", kits._Kit),
     "cell": ("Cell of a robot", "`aacmm plan --cell FILE`, `aj.files.load_cell`", cells._CellFile),
     "laboratory": (
         "Administrative data",
@@ -42,7 +42,7 @@ FORMATS: dict[str, tuple[str, str, type[BaseModel]]] = {
 }
 # Classes whose arguments say what the keys of their tables are.
 _DOCUMENTED = {f"{kind.__name__}Table": kind for kind in manifest_tables.TABLES} | {
-    f"{kind.__name__}Table": kind for kind in cells.simulated_kinds().values()
+    f"{kind.__name__}Table": kind for kind in kits.simulated_kinds().values()
 }
 
 

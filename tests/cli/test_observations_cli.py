@@ -430,3 +430,12 @@ def test_a_plan_with_a_kit(aacmm, tmp_path):
     assert 'a = "bar-a.csv"' in (tmp_path / "capture.toml").read_text()
     refused = aacmm("plan", "cheng2018-simulation", "-o", "p.csv", "--kit", "kit.toml", "--sockets", 3, expect=2)
     assert "--kit itself determines the artefacts and their placement, so --sockets" in refused.stderr
+
+
+def test_a_kit_is_simulated(aacmm, tmp_path):
+    kit = '[[points]]\nname = "tracker"\nbox = [[200, -300, 100], [600, 300, 500]]\nposes = 12\nu = 0.02\n'
+    (tmp_path / "kit.toml").write_text(kit)
+    aacmm("simulate", "ur10e", "-o", "c.h5", "--kit", "kit.toml", "--seed", 3)
+    (observation,) = aj.files.load_capture(tmp_path / "c.h5").capture.observations
+    assert (observation.name, len(observation.q)) == ("tracker", 12)
+    assert "--kit" in aacmm("simulate", "ur10e", "-o", "d.h5", expect=2).stderr

@@ -61,3 +61,20 @@ def test_bounds_that_explain_most_stand_before_their_imitations(paper_arm, captu
     first, *_ = findings_of(record)
     assert (first.code, first.concerns[0]) == ("on-bounds", "theta_3")
     assert first.explains > 0.9
+
+
+@pytest.mark.parametrize(("other", "u", "names"), [(0.02, 0.2, ("near", "far")), (0.2, 0.02, ()), (0.02, 0.02, ())])
+def test_an_instrument_that_agrees_far_better_than_stated(paper_arm, other, u, names):
+    """A second one that is far worse than it should be makes the first one no better."""
+    box = [[200, -300, 100], [600, 300, 500]]
+    frames = {"near": (0, 0, 1.0, 2000, 0, 0), "far": (0, 0, 0.2, -3000, 1000, 0)}
+    kinds = aj.data.observations
+    points = [
+        kinds.SimulatedPoints(name, box, 40, frame, u=by)
+        for (name, frame), by in zip(frames.items(), (0.02, other), strict=True)
+    ]
+    seen = aj.simulate(paper_arm, {}, observations=points, noise=aj.Noise(encoder_arcsec=2.0), seed=1)
+    stated = [kinds.MeasuredPoints(o.name, o.q, o.points, u=u) for o in seen.observations]
+    recording = aj.Recording(aj.Capture({}, observations=stated), ArmSpecification(paper_arm, "test"))
+    record = aj.calibrate_capture(recording, automatic=False)
+    assert [f.concerns for f in findings_of(record) if f.code == "u-too-large"] == [names] * bool(names)

@@ -1,6 +1,8 @@
 """[[pixels]] in manifests: tables of corners and nested lists, which image belongs to which pose, and bad input."""
 
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -183,3 +185,28 @@ def test_as_many_poses_as_images(tmp_path, seen):
     kept = [line for line in named if not line.startswith("frame_5,")]
     (tmp_path / "corners.csv").write_text("\n".join(kept) + "\n")
     assert_refused(lambda: read(tmp_path), "11 images and 12 poses")
+
+
+def test_images_are_read_and_drawn(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    example = Path(__file__).resolve().parents[2] / "examples" / "webcam"
+    (tmp_path / "images").mkdir()
+    for image in sorted((example / "images").iterdir())[:5]:
+        shutil.copy(image, tmp_path / "images")
+    cv2.imwrite(str(tmp_path / "images" / image.name), np.full((480, 640), 128, dtype=np.uint8))  # nothing in it
+    rows = (example / "joints.csv").read_text().splitlines()[:6]
+    (tmp_path / "joints.csv").write_text("\n".join(rows) + "\n")
+    shutil.copy(example / "webcam.toml", tmp_path)
+    shown = []
+
+    def progress(items, what):
+        shown.append((len(items), what))
+        return items
+
+    overlays = tmp_path / "overlays"
+    recording = aj.files.read_manifest(tmp_path / "webcam.toml", progress=progress, overlays=overlays)
+    assert shown == [(5, "Detecting corners")]
+    assert [image.corners > 0 for image in recording.images] == [True] * 4 + [False]
+    assert recording.images[4].refused
+    assert recording.capture.observations[0].images == tuple(f"images/{row[:6]}" for row in rows[1:5])
+    assert len([cv2.imread(str(path)).shape for path in overlays.iterdir()]) == 5

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ...core.errors import InputError
 from ...core.linear_algebra import inverse_positive_definite, products_by_column
@@ -374,6 +374,15 @@ def offset_of(target: str) -> str:
     return f"offset of {target}"
 
 
+class Aim(NamedTuple):
+    """A cone of directions from which something can be measured, and where on the arm it is measured."""
+
+    axis: tuple[float, float, float]  # of the last frame: points within the cone, against its normal
+    normal: tuple[float, float, float]  # in the base frame
+    half_angle: float  # rad
+    place: tuple[float, float, float]  # in the last frame, mm: what must stay above the table
+
+
 class AbstractSimulated(Declared):
     """An observation to simulate.
 
@@ -385,6 +394,7 @@ class AbstractSimulated(Declared):
     table: ClassVar[str]  # name of its tables in the file of a kit
     poses: int
     offset: Float[np.ndarray, " 3"] | None = None  # true place of the target in the last frame, mm; None: the probe
+    aim: Aim | None = None  # from where it can be measured, if not from everywhere
 
     @abc.abstractmethod
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
@@ -393,6 +403,10 @@ class AbstractSimulated(Declared):
     @abc.abstractmethod
     def recorded(self, q: Readings, transforms: Transforms, random: np.random.Generator) -> AbstractObservation:
         """The observation from the readings, and from the true transforms of the tip."""
+
+    def measurable(self, transforms: Transforms) -> Bool[np.ndarray, " m"]:
+        """Which of the true transforms of the tip allow a measurement."""
+        return np.ones(len(transforms), dtype=bool)
 
     def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "AbstractSimulated | None":
         """The same thing under another name and moved rigidly: by a rotation vector (rad) about the base's origin, and

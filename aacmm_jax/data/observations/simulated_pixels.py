@@ -11,7 +11,7 @@ from ...core.errors import InputError
 from ...core.rotations import rotation_matrix
 from ..cameras.camera import AbstractCamera, camera_models
 from .declared import FREE, declared
-from .observation import AbstractSimulated, Readings, Transforms
+from .observation import AbstractSimulated, Aim, Readings, Transforms
 from .pixels import Pixels
 
 _TRIED, _MOST_TRIED = 10, 500  # random poses for each one that is wanted, over the share of directions within the tilt
@@ -69,10 +69,11 @@ class SimulatedPixels(AbstractSimulated):
         self.camera_model.check_count(len(self.intrinsics), where)
         if not 0 < self.distance[0] <= self.distance[1]:
             raise InputError(f"distance of {where} is {self.distance}; give the least and the largest one, above 0.")
-        turn = np.asarray(rotation_matrix(self.mount[3:]))
+        turn, still = (np.asarray(rotation_matrix(w)) for w in (self.mount[3:], self.frame[:3]))
         # The tip that is led: a point before the camera, or the middle of the target.
         ahead = np.array([0.0, 0.0, self.distance.mean()]) if self.on_arm else self.middle
-        return {"offset": self.mount[:3] + turn @ ahead}
+        axis, normal, place = (tuple(map(float, part)) for part in (turn[:, 2], -still[:, 2], self.mount[:3]))
+        return {"offset": self.mount[:3] + turn @ ahead, "aim": Aim(axis, normal, self.tilt, place)}
 
     @property
     def camera_model(self) -> AbstractCamera:
@@ -123,6 +124,9 @@ class SimulatedPixels(AbstractSimulated):
             image_size=self.image_size,
             u_scale=self.u_scale,
         )
+
+    def measurable(self, transforms: Transforms) -> Bool[np.ndarray, " m"]:
+        return self._seen(transforms)[0]
 
     def _seen(self, transforms: Transforms) -> tuple[Bool[np.ndarray, " m"], Float[np.ndarray, "m k d"]]:
         """Which poses have the whole target in view, and its corners."""
