@@ -166,7 +166,12 @@ def webcam(arms=10):
     noise = aj.Noise(encoder_arcsec=300.0, seating=0.1)  # servos: 0.08 deg
     every = aj.Parameters.free_of(nominal)
     for seed in range(arms):
-        true = aj.perturbed_arm(every, length=1.0, angle=np.deg2rad(1.0), seed=seed)
+        # Every servo's zero by 1 deg and every length by 1 mm, with random signs; axes by up to 0.2 deg.
+        random = np.random.default_rng(seed)
+        signs, tilts = random.choice([-1.0, 1.0], len(every.names)), random.uniform(-0.2, 0.2, len(every.names))
+        sizes = [1.0 if name[0] in "adp" and not name.startswith("alpha") else np.deg2rad(1.0) for name in every.names]
+        sizes = np.where([name.startswith("alpha") for name in every.names], np.deg2rad(tilts), signs * sizes)
+        true = every.arm(np.asarray(every.vector()) + sizes)
         eye = kinds.SimulatedPixels(
             "eye", 60, "webcam", "board", grid(6, 4, 20.0), LENS, SIZE, mount=(0, 30, 10, 0.2, 0, 0),
             frame=(np.pi, 0, 0, 270, 40, -20), distance=(120, 350), tilt=1.1, u=0.5, u_intrinsics=np.inf,
