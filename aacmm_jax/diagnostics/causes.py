@@ -116,7 +116,7 @@ def _of_values(culprits: Sequence[Culprit]) -> Finding:
 
 
 def _of_joints(culprits: Sequence[Culprit]) -> Finding:
-    joints = [culprit.name for culprit in culprits]
+    joints = list(dict.fromkeys(culprit.name for culprit in culprits))  # one may be taken twice, larger each time
     chance = chance_text(max(culprit.probability for culprit in culprits))
     several = len(joints) > 1
     encoders = "the encoders of these joints were" if several else "the encoder of this joint were"
