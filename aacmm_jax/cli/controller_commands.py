@@ -56,7 +56,7 @@ def export(
         "camera-info: intrinsics of a camera (ROS, YAML); joint-origin, static-transform, opencv, matrix: frame of a "
         "camera or target, as the fixed joint of a URDF, a command of ROS 2, YAML of OpenCV, or 4 x 4 matrix (mm). "
         "Default: the format of the output's extension (.urdf, .json, .csv, .yaml, .py), otherwise toml.",
-        None,
+        "FORMAT",
         "--format",
     ),
     which: Literal["calibrated", "nominal", "true"] | None = option(

@@ -113,7 +113,7 @@ def test_a_manifest_states_the_unit_of_slides(tmp_path):
 
 def test_plans_are_tables_with_the_unit_of_each_joint():
     plan = KitPlan._make([()] * len(KitPlan._fields))
-    seated = {"kit": [SimpleNamespace(offset=None)], "observations": [Socket("A", Q)]}
+    seated = {"kit": [SimpleNamespace(offset=None, aim=None)], "observations": [Socket("A", Q)]}
     text = plans.plan_csv(plan._replace(arm=SCARA, retract=0.0, **seated))
     header, first = (line.split(",") for line in text.splitlines()[:2])
     assert header[:6] == ["pose", "observation", "point", "x_mm", "y_mm", "z_mm"]

@@ -24,7 +24,7 @@ OTHERS = {
     "study/finding.py": 1,  # percentile of a study
     "data/targets.py": 2,  # size of a marker, of that of its square
     "diagnostics/joint_travel.py": 2,  # of poses that are as near to another one
-    "diagnostics/recorded.py": 1,  # least improvement by another reading of a file
+    "diagnostics/corrections.py": 1,  # least improvement by another reading of a file
     "drift/results.py": 1,  # a number that rounds to 1
     "model/robust.py": 4,  # the efficiency of a loss, and a point of chi-square
     "planning/problem.py": 2,  # part of the reach
