@@ -188,8 +188,8 @@ def _of_part(
         tuple(USED if of_pose else HELD_OUT for of_pose in used),
         np.einsum("cxm,cm->mx", moved, position),
         distance,
-        angle,
-        pixels,
+        np.asarray(angle),
+        np.asarray(pixels),
         np.full(m, np.nan) if alone else u,
     )
 

@@ -196,7 +196,9 @@ class _Unseen(NamedTuple):
             roots = np.sqrt(np.maximum(values, 0.0))[:, None, :] * vectors
             private.append(np.asarray(followed(np.asarray(rows), roots, block.sizes)))
         private, joined = observed.by_observation(private), observed.by_observation(joined)
-        return cls(uncertainty, linear, influence, linear.parts(), private, joined, common, basis, along, kept)
+        return cls(
+            uncertainty, linear, influence, linear.parts(), private, joined, np.asarray(common), basis, along, kept
+        )
 
 
 def _part_of(problem: _Unseen, number: int, part: ObservationRows) -> _Part:

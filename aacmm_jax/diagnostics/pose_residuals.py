@@ -48,7 +48,11 @@ def observation_residuals(record: CalibrationRecord) -> tuple[ObservationResidua
             ObservationResiduals(
                 observation=observation,
                 distance=np.linalg.norm(position, axis=0),
-                other={unit: observation.other_sizes(np.asarray(part.values)) for unit in of_unit if unit != "mm"},
+                other={
+                    unit: np.asarray(observation.other_sizes(np.asarray(part.values)))
+                    for unit in of_unit
+                    if unit != "mm"
+                },
                 normalised=np.sqrt(np.sum(white**2, axis=0) / observation.pose_equations),
                 weight=np.asarray(part.weight),
                 u={unit: float(np.sqrt(np.mean(variances[:, rows]))) for unit, rows in of_unit.items()},

@@ -84,7 +84,8 @@ def rough_fit(nominal: ArmSpecification, capture: Capture) -> RoughFit | None:
     except (InputError, np.linalg.LinAlgError):
         return None
     linear = solution.linear
-    parts = linear.observed.split(np.asarray(linear.z)[len(names) :])
+    split = linear.observed.split(np.asarray(linear.z)[len(names) :])
+    parts = {name: np.asarray(numbers) for name, numbers in split.items()}
     arm = to_numpy(space.arm(np.asarray(linear.z)[: len(names)]))
     fit = RoughFit(arm, names, linear.observed.observations, parts, size, np.inf, np.inf, np.inf)
     distances = np.concatenate([fit.distances(observation) for observation in fit.observations])

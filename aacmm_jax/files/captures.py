@@ -161,8 +161,9 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
 
 
 def _field(entry: Entry) -> Field:
-    content = {"points": "number", "ids": "count"}.get(entry.content, entry.content)
-    return Field(entry.says, entry.unit, entry.dimensions, content)
+    if entry.content == "ids":
+        return Field(entry.says, entry.unit, entry.dimensions, "count")
+    return Field(entry.says, entry.unit, entry.dimensions, "number" if entry.content == "points" else entry.content)
 
 
 def _observation(path: str | os.PathLike, table: StoredTable) -> AbstractObservation:

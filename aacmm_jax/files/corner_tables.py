@@ -44,7 +44,7 @@ class Seen(NamedTuple):
     size: tuple[int, int] | None = None  # width, height, px
 
 
-def read_corners(file: InputFile, target: AbstractTarget, dimensions: int, columns: Mapping[str, Picked]) -> list[Seen]:
+def read_corners(file: InputFile, target: AbstractTarget, dimensions: int, columns: Mapping[Any, Picked]) -> list[Seen]:
     """The corners of each image, in the order of the file.
 
     Args:

@@ -65,12 +65,15 @@ _FIELDS: dict[str, Any] = {
     table: (list[_model(kind)], Field(default_factory=list))  # pyright: ignore[reportInvalidTypeForm]
     for table, kind in _KINDS.items()
 }
-_OF_CAMERAS = {"camera": CameraTable, "target": TargetTable, "pixels": KitPixels}
-_FIELDS |= {
-    table: (list[kind], Field(default_factory=list))  # pyright: ignore[reportInvalidTypeForm]
-    for table, kind in _OF_CAMERAS.items()
-}
-_Kit = create_model("_Kit", __base__=Strict, **_FIELDS)
+
+
+class _OfCameras(Strict):
+    camera: list[CameraTable] = Field(default_factory=list)
+    target: list[TargetTable] = Field(default_factory=list)
+    pixels: list[KitPixels] = Field(default_factory=list)
+
+
+_Kit = create_model("_Kit", __base__=_OfCameras, **_FIELDS)
 
 
 def read_kit(path: str | os.PathLike) -> list[KitItem]:

@@ -131,7 +131,7 @@ def _read(path: str | os.PathLike, detecting: Detecting = _QUIETLY) -> tuple[Rec
         return recording, readings
 
 
-def _stated(model: PosesManifest) -> tuple[str, ...]:
+def _stated(model: Any) -> tuple[str, ...]:
     """What the manifest states of readings and points, as `Recording.stated` names it."""
     given = set() if model.angles is None else model.angles.model_fields_set
     stated = given & {"columns", "sign", "offset", "unit"}

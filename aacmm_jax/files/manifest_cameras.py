@@ -1,5 +1,6 @@
 """Tables of a manifest for cameras: [[camera]], [[target]] and [[pixels]]."""
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, FiniteFloat, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
@@ -70,7 +71,7 @@ class PixelsTable(NamedTable):
     on_arm: Literal["camera", "target"] = "camera"
     images: str | None = None  # path with wildcards
     corners: str | None = None  # table: image, id, u, v; or JSON
-    corner_columns: dict[Literal["image", "id", "corners"], Picked] = Field(default_factory=dict)
+    corner_columns: Mapping[Literal["image", "id", "corners"], Picked] = Field(default_factory=dict)
     u: PositiveFloat | None = None  # px, or mm of a camera that measures points
 
     @model_validator(mode="after")

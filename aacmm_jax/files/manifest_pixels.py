@@ -56,7 +56,8 @@ class Cameras:
 
     def __init__(self, source: Source, stated: Sequence[CameraTable], targets: Sequence[TargetTable]):
         self._source = source
-        self.cameras, self.targets = ({table.name: table for table in tables} for tables in (stated, targets))
+        self.cameras = {table.name: table for table in stated}
+        self.targets = {table.name: table for table in targets}
         for what, tables, by_name in (("camera", stated, self.cameras), ("target", targets, self.targets)):
             if len(by_name) < len(tables):
                 names = [table.name for table in tables]
@@ -195,10 +196,11 @@ def _seen(
     names = natural_order([path.relative_to(source.folder).as_posix() for path in paths if path.is_file()])
     if not names:
         raise InputError(f"no image matches '{pattern}' in {source.folder}; check the path.")
+    size = None if camera.image_size is None else tuple(int(number) for number in camera.image_size)
     seen = []
     for name in detecting.progress(names, "Detecting corners"):
         image = source.open(name)
-        found = detect(image, target, image_size=camera.image_size)
+        found = detect(image, target, image_size=size)
         if detecting.overlays is not None:
             detecting.overlays.mkdir(parents=True, exist_ok=True)
             # Images of several folders may have the same name.

@@ -115,7 +115,7 @@ class _Reader:
     def __init__(self, source: Source, kind: type[Declared], table: Any, where: str):
         self._source, self._table, self._where = source, table, where
         preset = PRESETS[table.preset] if table.preset is not None else Preset({})
-        self._preset = preset._replace(columns=getattr(kind, "usual", {}) | preset.columns)
+        self._preset = preset._replace(columns={**getattr(kind, "usual", {}), **preset.columns})
         # In a manifest of points, a point stands where a pose has its readings.
         self.entries = {source.quantity if entry.name == "q" else entry.name: entry for entry in kind.entries}
         columns = table.columns if isinstance(table.columns, dict) else {source.quantity: table.columns}

@@ -252,7 +252,8 @@ def times(matrices: Float[AnyArray, "r c m"], columns: Float[AnyArray, "k c m"])
     as slowly."""
     xp = namespace(matrices, columns)
     if xp is np and columns.shape[1] > _SMALL:
-        return np.moveaxis(np.moveaxis(matrices, 2, 0) @ np.moveaxis(columns, (2, 1), (0, 1)), (0, 1, 2), (2, 1, 0))
+        by_pose = np.moveaxis(np.asarray(matrices), 2, 0) @ np.moveaxis(np.asarray(columns), (2, 1), (0, 1))
+        return np.moveaxis(by_pose, (0, 1, 2), (2, 1, 0))
     return xp.stack([sum(row[c][None] * columns[:, c] for c in range(columns.shape[1])) for row in matrices], axis=1)
 
 

@@ -280,13 +280,13 @@ def _ladder(recording: Recording, options: Any) -> ComparedModels | None:
     models = [model for model in default_models(nominal.arm, capture) if _FUNCTIONS not in model]
     ladder: ComparedModels | None = None
     try:
-        ladder = options.stage("Comparing models", lambda: compared(models))
+        tried = ladder = options.stage("Comparing models", lambda: compared(models))
         # Models with more functions of each joint take longer, and the next is tried only where the last explains more.
         for functions in (_SOME, _FUNCTIONS):
-            before = max(ladder.models, key=lambda model: model.log_evidence)
+            before = max(tried.models, key=lambda model: model.log_evidence)
             richer = _with_functions(before.model, functions)
             added = options.stage(f"Comparing models ({richer})", lambda model=richer: compared([model]))
-            ladder = ladder._replace(models=(*ladder.models, *added.models))
+            tried = ladder = tried._replace(models=(*tried.models, *added.models))
             if added.models[0].log_evidence < before.log_evidence + _WORTH:
                 break
     except (InputError, np.linalg.LinAlgError):  # too few poses to hold some out, or to fit that many functions

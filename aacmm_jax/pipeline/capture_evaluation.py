@@ -6,7 +6,7 @@ One call each, whose options state their defaults once.
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from ..acceptance.results import Measured
 from ..acceptance.standards import OF_SPHERES, STANDARDS, checked_standards
 from ..calibration.pose_table import noise_of_poses
 from ..calibration.record import CalibrationRecord, uncertainty_of
-from ..core.arguments import NotNegative, checked_arguments, with_options
+from ..core.arguments import NotNegative, OneOf, checked_arguments, with_options
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import listed, shorten
@@ -64,7 +64,7 @@ class EvaluationOptions(NamedTuple):
     measuring_range: float | None = None
     maxima: Mapping[str, NotNegative] = MappingProxyType({})
     calibration_warnings: Sequence[str] | None = None
-    keep: Sequence[Literal["target", "frame"]] = ()
+    keep: Sequence[str] = ()
 
 
 @checked_arguments
@@ -247,6 +247,7 @@ def _kept(record: CalibrationRecord, uncertainty: Uncertainty, capture: Capture,
     in_capture, found = Observed.of(capture, None).names, record.observed.geometry
     parts: list[str] = []
     for kind in keep:
+        OneOf(kinds)(kind, "keep")
         of_kind, of_calibration = (
             [name for name in names if name.startswith(kinds[kind])] for names in (in_capture, found)
         )

@@ -106,7 +106,7 @@ def _cells(image: Image) -> tuple[np.ndarray, np.ndarray, float]:
 def coverage_chart(image: Image) -> Chart:
     """How many corners were seen in each part of the image."""
     x, y, _ = _cells(image)
-    counts = np.histogram2d(*image.corners.T, (x, y))[0].astype(int)
+    counts = np.histogram2d(image.corners[:, 0], image.corners[:, 1], (x, y))[0].astype(int)
     columns, rows = np.nonzero(counts)
     number, cells = counts[columns, rows], counts.size
     limits = np.unique(np.round(np.linspace(1, number.max() + 1, SHADES + 1)))  # a shade has less than its upper limit
@@ -143,7 +143,7 @@ def residual_chart(image: Image, most: int | None = None) -> Chart:
     ]
     labels = [f"{image.names[i]}, corner {number}" for i, number in zip(image.owner, image.ids, strict=True)]
     words = [f"{labels[i]}: {format_number(float(sizes[i]))} {unit}" for i in chosen]
-    marks.append(Marks("", *starts[chosen].T, "dot", "soft", words, size=2.5))
+    marks.append(Marks("", starts[chosen, 0], starts[chosen, 1], "dot", "soft", words, size=2.5))
     description = (
         f"Arrows lead from where the calibration has each corner towards where it was seen, {factor:g} times as long. "
         f"Root mean square {np.sqrt(np.mean(sizes**2)):.3g} {unit}, median {usual:.3g} {unit}, largest "
@@ -222,7 +222,8 @@ def _arrows(image: Image, name: str, starts: np.ndarray, steps: np.ndarray, tone
     back, aside = -_HEAD * head * steps, 0.5 * _HEAD * head * steps[:, ::-1] * [-1, 1]
     nothing = np.full_like(starts, np.nan)
     path = np.stack([starts, ends, nothing, ends + back + aside, ends, ends + back - aside, nothing], axis=1)
-    return Marks(name, *path.reshape(-1, 2).T, "line", tone, size=3)
+    x, y = path.reshape(-1, 2).T
+    return Marks(name, x, y, "line", tone, size=3)
 
 
 def shapes_of(

@@ -135,8 +135,9 @@ class Uncertainty(eqx.Module):
     def law(self) -> Law:
         """How well the variances of `parts` are known: the first elsewhere than in the groups that taught the model, if
         the data chose it."""
-        chosen = self.between is not None and self.between.chosen
-        scatter = self.between.law(self.scatter_degrees_of_freedom) if chosen else self.scatter
+        scatter = self.scatter
+        if self.between is not None and self.between.chosen:
+            scatter = self.between.law(self.scatter_degrees_of_freedom)
         return scatter if self.components is None else scatter.joined(self.components.law)
 
     def parts(self, derivatives: Float[AnyArray, "... p"]) -> Float[AnyArray, "... c"]:

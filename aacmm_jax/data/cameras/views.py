@@ -88,7 +88,7 @@ def _rows(
     m = len(corners.values)
     turned = np.moveaxis(corners.points @ views.rotation.swapaxes(1, 2), -1, 0)
     seen = corners.model.project(turned + views.origin.T[:, :, None], intrinsics[:, None, None])
-    by_point = np.moveaxis(seen.by_point, 1, 0)  # (3, d, m, c)
+    by_point = np.moveaxis(np.asarray(seen.by_point), 1, 0)  # (3, d, m, c)
     flat = by_point.reshape(3, -1)
     by_turn = cross(np.broadcast_to(turned[:, None], by_point.shape).reshape(3, -1), flat).reshape(by_point.shape)
     weight = (corners.present[..., None] / corners.u).reshape(m, -1)
@@ -97,8 +97,8 @@ def _rows(
         return np.moveaxis(values, (-3, -2, -1), (2, 0, 1)).reshape(m, weight.shape[1], *values.shape[:-3])
 
     by_view = rows(np.concatenate([by_turn, by_point])) * weight[..., None]
-    residual = rows(seen.values) - corners.values.reshape(m, -1)
-    return residual * weight, by_view, rows(seen.by_intrinsics) * weight[..., None]
+    residual = rows(np.asarray(seen.values)) - corners.values.reshape(m, -1)
+    return residual * weight, by_view, rows(np.asarray(seen.by_intrinsics)) * weight[..., None]
 
 
 def _refined(

@@ -64,6 +64,8 @@ class Pixels(AbstractObservation):
     stacks, eliminates = False, False
     fixes_scale = True
     derived = ("still", "unsure")
+    still: str  # what is not on the arm
+    unsure: tuple[int, ...]  # which intrinsics are not exact
     corners: Float[AnyArray, "m c d"] = declared(
         "measured corner", "px", "pose", "corner", "image_axis", more="mm of a camera that measures points in space"
     )
@@ -276,6 +278,7 @@ class Pixels(AbstractObservation):
         return xp.stack(columns)
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
+        assert self.views is not None  # see `completed`
         xp = namespace(tips, offset, self.views)
         axes = xp.stack(tips.axes, axis=1)  # (3, 3, m): columns are axes
         turns, shifts = xp.moveaxis(rotation_matrix(self.views[:, :3].T), -1, 0), self.views[:, 3:]

@@ -72,7 +72,7 @@ class SimulatedPixels(AbstractSimulated):
         turn, still = (np.asarray(rotation_matrix(w)) for w in (self.mount[3:], self.frame[:3]))
         # The tip that is led: a point before the camera, or the middle of the target.
         ahead = np.array([0.0, 0.0, self.distance.mean()]) if self.on_arm else self.middle
-        axis, normal, place = (tuple(map(float, part)) for part in (turn[:, 2], -still[:, 2], self.mount[:3]))
+        axis, normal, place = ((float(x), float(y), float(z)) for x, y, z in (turn[:, 2], -still[:, 2], self.mount[:3]))
         return {"offset": self.mount[:3] + turn @ ahead, "aim": Aim(axis, normal, self.tilt, place)}
 
     @property
@@ -97,7 +97,7 @@ class SimulatedPixels(AbstractSimulated):
         else:
             pixels = random.uniform(0.2, 0.8, (2, count)) * self.image_size[:, None]
             seen = self.camera_model.directions(pixels, self.intrinsics)
-        return (seen * random.uniform(*self.distance, count)).T @ turn.T + self.frame[3:]
+        return (seen * random.uniform(self.distance[0], self.distance[1], count)).T @ turn.T + self.frame[3:]
 
     def recorded(self, q: Readings, transforms: Transforms, random: np.random.Generator) -> Pixels:
         seen, corners = self._seen(transforms)
@@ -139,7 +139,7 @@ class SimulatedPixels(AbstractSimulated):
         points = self.scale * self.points @ board.swapaxes(1, 2) + (place - centre)[:, None]
         before = np.moveaxis(points @ camera, -1, 0)  # (3, m, k)
         model = self.camera_model
-        values = np.moveaxis(model.project(before, self.intrinsics[:, None, None]).values, 0, -1)
+        values = np.moveaxis(np.asarray(model.project(before, self.intrinsics[:, None, None]).values), 0, -1)
         sight = before.mean(axis=2)
         size = np.linalg.norm(sight, axis=0)
         normal = np.einsum("mij,mi->jm", camera, board[:, :, 2])
