@@ -253,7 +253,7 @@ def test_uncertainties_are_printed(aacmm):
     shown = " ".join(aacmm("show", "c.h5").stdout.split())
     assert shown.index("Cross-validation: each") < shown.index("Errors in the poses used for identification")
     # More than 1.96: with two lengths, errors of places have a probability.
-    assert "Expanded uncertainty U over all joint limits (95 %, coverage factor 1.97 to 2.06)" in shown
+    assert "Expanded uncertainty U over all joint limits (95 %, coverage factor 1.97 to 2.02)" in shown
     assert "Observability: rank 21 of 21" in shown
 
 
