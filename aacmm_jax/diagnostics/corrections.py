@@ -65,8 +65,11 @@ class _Correction(NamedTuple):
     zero: str = ""  # of a joint, which is not known
 
 
-def likely_cause(arm: Arm, capture: Capture) -> Mistake | None:
-    """The mistake whose correction makes the residuals by the nominal arm far smaller, if there is one."""
+def likely_cause(arm: Arm, capture: Capture, bounded: Sequence[str] = ()) -> Mistake | None:
+    """The mistake whose correction makes the residuals by the nominal arm far smaller, if there is one.
+
+    The zero of a joint in ``bounded`` is one of the arm, which wider bounds may reach.
+    """
     arm, capture = to_numpy((arm, capture))
     sockets = [Socket(name, q) for name, q in capture.sockets.items() if len(q) > 1]
     scattering = [*sockets, *capture.observations]
@@ -95,7 +98,7 @@ def likely_cause(arm: Arm, capture: Capture) -> Mistake | None:
         f"Likely cause: {best.cause}. Correcting this reduces the residuals (nominal arm) from {given:.3g} to "
         f"{rms:.3g} mm RMS.{best.line}{also}"
     )
-    return Mistake(says, best.concerns, best.of_readings)
+    return Mistake(says, best.concerns, best.of_readings, of_bounds=not alike and best.zero in bounded)
 
 
 def _thinned(observations: Sequence[AbstractObservation]) -> Capture:

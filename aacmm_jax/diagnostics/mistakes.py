@@ -51,7 +51,8 @@ def single_mistake(case: Case) -> Mistake | None:
     record, fit, wrong = case.record, case.once(fitted_roughly), case.once(misplaced)
     nominal, capture = record.recording.nominal, record.recording.capture
     if fit is None:
-        return likely_cause(nominal.arm, capture)
+        # An offset that somebody stated is right; the zero is then wrong in the arm.
+        return likely_cause(nominal.arm, capture, nominal.space().names if "offset" in record.recording.stated else ())
     if wrong:
         first, *others = wrong
         also = f"; {shorten([f'{shorten(w.names, 3)}: {w.says}' for w in others], 2)}" if others else ""
