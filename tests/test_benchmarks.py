@@ -50,7 +50,7 @@ def test_a_part_runs_and_names_who_is_absent(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("placements", "most"), [(3, 1.45), (8, 1.3)])
+@pytest.mark.parametrize(("placements", "most"), [(3, 1.6), (8, 1.3)])
 def test_intervals_from_few_placements_hold(placements, most):
     """64 trials of the benchmark, whose 1,000 are the measure; the errors of one trial are alike (+-5 %)."""
     sys.path.insert(0, str(ROOT / "benchmarks"))
