@@ -30,6 +30,7 @@ from ..kinematics.arm import (
     neighbouring_arm,
     parameter_names,
     value_of,
+    with_chains,
 )
 from ..kinematics.independence import equations, generic_poses, poses_in_sockets
 from ..kinematics.inverse_kinematics import SocketPoses, project_to_centroids
@@ -213,7 +214,7 @@ def _columns_of_both(arm: Arm, space: Parameters, fixed: tuple[str, ...]) -> lis
     """Derivatives of the tips by free parameters and fixed lengths at random configurations, less what they have in
     common: of the nominal arm and of a neighbouring one, which has no special position."""
     names, matrices = (*space.names, *fixed), []
-    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (_CONFIGURATIONS, arm.joints))
+    q = with_chains(arm, np.random.default_rng(0).uniform(-np.pi, np.pi, (_CONFIGURATIONS, arm.joints)))
     for variant in (arm, neighbouring_arm(arm, space.names)):
         columns = jacobian_at(variant, q, names)
         matrices.append((columns - columns.mean(axis=0)).reshape(-1, len(names)))

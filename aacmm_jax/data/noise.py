@@ -70,7 +70,8 @@ class Noise(eqx.Module):
             return self.encoder
         xp = namespace(self.encoder, self.linear_encoder)
         angular = self.encoder * xp.asarray(kinds.units)
-        return angular if self.linear_encoder is None else xp.where(kinds.mask(), self.linear_encoder, angular)
+        each = angular if self.linear_encoder is None else xp.where(kinds.mask(), self.linear_encoder, angular)
+        return each * kinds.read if kinds.followers else each
 
     def of_columns(self, kinds: JointKinds | None, joints: int, columns: int) -> Float[np.ndarray, " columns"]:
         """Standard deviations of all columns of readings, rad and mm; 0 for torques and temperatures."""

@@ -5,7 +5,7 @@ from typing import Annotated, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..core.arguments import Range, check_finite, checked, checked_arguments, items_of, real_number, shown
 from ..core.arrays import Numbers, as_floats
@@ -13,8 +13,8 @@ from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.random_keys import random_generator, random_key, random_numbers
 from ..core.units import ARCSEC
-from ..kinematics.arm import Arm, is_single, joint_limits
-from ..kinematics.chain import length_scale
+from ..kinematics.arm import Arm, is_single, joint_limits, tips_of
+from ..kinematics.chain import length_scale, of_joints
 from ..kinematics.corrected_arm import holding_torques
 from ..kinematics.correction_kinds import REFERENCE_TEMPERATURE
 from ..kinematics.inverse_kinematics import random_configurations
@@ -40,6 +40,7 @@ def simulate(
     resolution_arcsec: float | Sequence[float] = 0.0,
     limits: Sequence[Sequence[float]] | None = None,
     observations: Iterable[AbstractSimulated] = (),
+    chains: Mapping[str, str | Sequence[str]] | None = None,
     temperature: Numbers | None = None,
     seed: int = 0,
 ) -> Capture:
@@ -63,6 +64,8 @@ def simulate(
         limits: Lowest and highest reading of each joint, ``(n, 2)``, rad, or mm of prismatic joints; by default the
             arm's own, else +-pi (a prismatic joint has no default).
         observations: Other observations to record (`data.observations`), with their true geometry.
+        chains: Of a robot, by socket or observation the chain that is there, or those that take turns; by default all
+            chains take turns.
         temperature: Of an arm with a thermometer, C: one for all poses, by default 20, or the lowest and the highest,
             between which each pose's is drawn; the last column of the readings.
         seed: Seed of poses and noise.
@@ -109,11 +112,14 @@ def simulate(
     exact = np.repeat(places, list(counts.values()), axis=0)
     references = _reference_lengths(points, lengths, length_key)
     labels = np.repeat([f"socket '{name}'" for name in counts], list(counts.values())).tolist()
-    angles = recorder.read(recorder.configurations(arm, exact, reach_key, seat_key, labels), encoder_key)
+    taken = _chain_numbers(arm, chains, {**counts}, [thing.name for thing in simulated])
+    of_poses = np.concatenate([np.resize(taken[name], count) for name, count in counts.items()] or [np.zeros(0, int)])
+    angles = recorder.read(recorder.configurations(arm, exact, reach_key, seat_key, labels, of_poses), encoder_key)
     ends = np.cumsum(list(counts.values()))
     readings = {name: angles[end - count : end] for (name, count), end in zip(counts.items(), ends, strict=True)}
     keys = [jax.random.fold_in(random_key(seed), number) for number in range(len(simulated))]
-    others = [recorder.recorded(thing, key) for thing, key in zip(simulated, keys, strict=True)]
+    pairs = zip(simulated, keys, strict=True)
+    others = [recorder.recorded(thing, key, taken.get(getattr(thing, "name", ""))) for thing, key in pairs]
     return Capture(readings, references, others)
 
 
@@ -128,15 +134,26 @@ class _Recorder(NamedTuple):
     random: np.random.Generator  # of temperatures
 
     def configurations(
-        self, holding: Arm, points: Float[np.ndarray, "m 3"], reach_key: Array, seat_key: Array, labels: Sequence[str]
+        self,
+        holding: Arm,
+        points: Float[np.ndarray, "m 3"],
+        reach_key: Array,
+        seat_key: Array,
+        labels: Sequence[str],
+        chain: Int[np.ndarray, " m"],
     ) -> Float[np.ndarray, "m columns"]:
         """Random configurations of an arm at points, where the seat lets it be; with torques and temperatures."""
         targets = points + self.noise.seating * random_numbers("normal", seat_key, points.shape)
         low, high = self.temperatures
         temperature = self.random.uniform(low, high, (len(labels), int(holding.thermometer)))
-        at_zero = np.concatenate([np.zeros((len(labels), holding.joints)), temperature], axis=1)
+        chains = chain[:, None].astype(float) if holding.chains else np.zeros((len(labels), 0))
+        at_zero = np.concatenate([np.zeros((len(labels), holding.joints)), chains, temperature], axis=1)
         targets = targets / length_scale(holding.geometry, at_zero)[:, None]
-        angles = random_configurations(holding, targets, reach_key, self.limits, labels=labels)
+        of_poses = chain if holding.chains else None
+        angles = random_configurations(holding, targets, reach_key, self.limits, labels=labels, chain=of_poses)
+        if holding.chains or holding.fixed or holding.mimic:  # joints that follow others, as they are
+            whole = np.asarray(angles)
+            angles = np.hstack([of_joints(holding.geometry, whole.T).T, whole[:, holding.joints :]])
         torques = [holding_torques(holding, np.asarray(angles))] if holding.torques else []
         return np.concatenate([angles, *torques, temperature], axis=1)
 
@@ -147,7 +164,9 @@ class _Recorder(NamedTuple):
         step = np.where(self.step > 0, self.step, 1.0)
         return np.concatenate([np.where(self.step > 0, np.round(shown / step) * step, shown), beside], axis=1)
 
-    def recorded(self, simulated: AbstractSimulated, key: Array) -> AbstractObservation:
+    def recorded(
+        self, simulated: AbstractSimulated, key: Array, chain: Int[np.ndarray, " c"] | None
+    ) -> AbstractObservation:
         """One simulated observation."""
         if not isinstance(simulated, AbstractSimulated):
             raise InputError(
@@ -159,11 +178,28 @@ class _Recorder(NamedTuple):
         holding = self.arm if simulated.offset is None else to_numpy(self.arm.replace(probe=simulated.offset))
         exact = simulated.tips(random)
         labels = [f"observation '{simulated.name}'"] * len(exact)
-        angles = self.configurations(holding, exact, reach_key, seat_key, labels)
+        of_poses = np.resize(np.zeros(1, int) if chain is None else chain, len(exact))
+        angles = self.configurations(holding, exact, reach_key, seat_key, labels, of_poses)
         # An instrument sees the tip where it is: the seat's error moves the tip, and not what it is compared with.
         transforms = np.asarray(holding.pose(angles)).copy()
         transforms[:, :3, 3] = exact
         return simulated.recorded(self.read(angles, encoder_key), transforms, random)
+
+
+def _chain_numbers(
+    arm: Arm, given: Mapping[str, str | Sequence[str]] | None, sockets: Mapping[str, int], others: Sequence[str]
+) -> dict[str, Int[np.ndarray, " c"]]:
+    """Numbers of the chains that take turns at each socket and observation, by default all."""
+    numbers = {name: number for number, (name, _) in enumerate(arm.chains)}
+    taken = {name: np.arange(tips_of(arm)) for name in (*sockets, *others)}
+    for where, names in (given or {}).items():
+        if where not in taken:
+            raise InputError(f"chains are given for '{where}', which is not simulated{nearest(where, taken)}")
+        for name in (chosen := items_of(names, "chains")):
+            if name not in numbers:
+                raise InputError(f"the robot has no chain '{name}'{nearest(str(name), numbers)}")
+        taken[where] = np.array([numbers[name] for name in chosen])
+    return taken
 
 
 def _checked_temperatures(arm: Arm, given: Numbers | None) -> Float[np.ndarray, " 2"]:

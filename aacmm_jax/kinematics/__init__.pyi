@@ -19,6 +19,9 @@ from .parameters import Parameters as Parameters
 from .parameters import perturbed_arm as perturbed_arm
 from .priors import Prior as Prior
 from .priors import default_prior as default_prior
+from .robots import ChainOf as ChainOf
+from .robots import chain_of as chain_of
+from .robots import together as together
 from .workspace import Cone as Cone
 from .workspace import arm_reach as arm_reach
 from .workspace import closest_approach as closest_approach

@@ -2,8 +2,8 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import lru_cache, partial
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -15,16 +15,16 @@ from ..core.arguments import NOT_EMPTY, Range, checked, items_of, shown
 from ..core.arrays import Numbers, as_array, as_floats
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, in_chunks, namespace, numpy_if_known, to_jax, to_numpy
-from ..core.text import pluralise
 from .chain import Corrections, Geometry, JointKinds, tip_pose
 from .jacobian import Indices, tip_jacobian, tip_position
+from .joint_checks import Limits, checked_chains, checked_limits, checked_mimic
 
 LENGTHS = ("a", "d", "probe")
 DOWN = (0.0, 0.0, -1.0)
 _AXES = ("x", "y", "z")
 _LENGTH_STEP, _ANGLE_STEP = 1.0, 1e-3  # comparable at the tip of an arm of about 1 m
-Limits = Sequence[Sequence[float]]  # lowest and highest reading of each joint
 JointLimits = Float[np.ndarray, "n 2"]
+NEARLY_PARALLEL = 0.02  # |sin alpha|, about 1 degree, below which Denavit-Hartenberg parameters are nearly singular
 _BY_JOINT, _BY_TERM, _VECTOR = (Float[Array, shape] for shape in ("... joints", "... coefficients", "... 3"))
 _LARGEST = 20_000  # configurations: up to here NumPy is sooner done than a compiler
 
@@ -52,6 +52,14 @@ class Arm(eqx.Module):
         corrections: What joints do besides their readings; `kinematics.with_corrections` makes them.
         torques: Whether readings have n more columns after those of the joints: the torques of their drives, N m (N of
             prismatic joints), of which only corrections by torques make use. Not of an arm with a single joint.
+        fixed: Numbers of joints that do not move, from 1: rigid links of a robot, before a branch or below a base.
+            Their column of the readings is not used.
+        mimic: Joints that follow another one: ``(joint, followed joint, factor, offset)``, numbers from 1, the offset
+            in rad, or mm. Their column of the readings is not used.
+        chains: Joints of each chain of a robot by name, from the base to the tip, numbers from 1. The column after
+            those of the joints is then the number of the chain that a pose is of, from 0; joints of other chains do not
+            matter for it. ``probe`` has the tips of all chains in turn, ``(..., 3 c)``: ``probe_x`` of the first chain,
+            ``probe2_x`` of the second.
         thermometer: Whether readings have one more, last column: the temperature of the arm, C, of which only thermal
             expansion makes use. Where it is missing, the arm is taken to be at 20 C.
 
@@ -76,6 +84,9 @@ class Arm(eqx.Module):
     corrections: Corrections | None
     torques: bool = eqx.field(static=True)
     thermometer: bool = eqx.field(static=True)
+    fixed: tuple[int, ...] = eqx.field(static=True)
+    mimic: tuple[tuple[int, int, float, float], ...] = eqx.field(static=True)
+    chains: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -93,13 +104,18 @@ class Arm(eqx.Module):
         corrections: Corrections | None = None,
         torques: bool = False,
         thermometer: bool = False,
+        fixed: Iterable[int] = (),
+        mimic: Iterable[tuple[int, int, float, float]] = (),
+        chains: Mapping[str, Sequence[int]] | Iterable[tuple[str, Sequence[int]]] = (),
     ):
         sizes: dict[str, int] = {}
         self.alpha = checked(alpha, Annotated[_BY_JOINT, NOT_EMPTY], "alpha", sizes)
         self.a, self.d = checked(a, _BY_JOINT, "a", sizes), checked(d, _BY_JOINT, "d", sizes)
         self.theta = checked(np.zeros(self.alpha.shape) if theta is None else theta, _BY_JOINT, "theta", sizes)
         self.beta = None if beta is None else checked(beta, _BY_JOINT, "beta", sizes)
-        self.probe = checked(probe, _VECTOR, "probe")
+        self.chains = checked_chains(chains, self.joints)
+        tips = probe if not self.chains or np.shape(probe) != (3,) else np.tile(probe, len(self.chains))
+        self.probe = checked(tips, _tips_annotation(tips_of(self)), "probe")
         self.corrections, self.coefficients, self.gravity = corrections, None, None
         if corrections is not None:
             sizes["coefficients"] = len(corrections.functions.terms)
@@ -122,7 +138,9 @@ class Arm(eqx.Module):
             ) from error
         numbers = checked(prismatic, Sequence[Annotated[int, Range(1, self.joints)]], "prismatic")
         self.prismatic = tuple(sorted({int(number) for number in numbers}))
-        self.limits = None if limits is None else checked_limits(limits, self.joints, self.prismatic)
+        self.fixed = tuple(sorted(set(checked(fixed, Sequence[Annotated[int, Range(1, self.joints)]], "fixed"))))
+        self.mimic = checked_mimic(mimic, self.joints, self.fixed)
+        self.limits = None if limits is None else checked_limits(limits, self.joints, self.prismatic, self.fixed)
         self.torques = bool(torques) or (corrections is not None and corrections.functions.by_torque)
         if self.torques and self.joints == 1:
             raise InputError("torques need an arm with at least two joints; create the arm without torques.")
@@ -136,19 +154,26 @@ class Arm(eqx.Module):
     @property
     def columns(self) -> int:
         """Number of columns of readings: the joints, their torques and the thermometer where there are such."""
-        return self.joints * (1 + self.torques) + self.thermometer
+        return self.joints * (1 + self.torques) + self.thermometer + bool(self.chains)
 
     @property
     def possible_columns(self) -> tuple[int, ...]:
         """Numbers of columns that readings may have: torques and temperatures may be missing."""
         beside = {0, self.joints * self.torques}
-        return tuple(sorted({self.joints + more + last for more in beside for last in {0, int(self.thermometer)}}))
+        last = {int(bool(self.chains)) + warmth for warmth in {0, int(self.thermometer)}}
+        return tuple(sorted({self.joints + more + count for more in beside for count in last}))
 
     @property
     def geometry(self) -> Geometry:
         """The parameters and the kinds of the joints, without the limits."""
         prismatic = self.prismatic  # read once: Equinox looks attributes up in Python
-        kinds = JointKinds(tuple(i in prismatic for i in range(1, self.joints + 1))) if prismatic else None
+        kinds = None
+        if prismatic or self.chains or self.fixed or self.mimic:
+            still = tuple((i - 1, i - 1, 0.0, 0.0) for i in self.fixed)
+            following = tuple((i - 1, source - 1, factor, zero) for i, source, factor, zero in self.mimic)
+            chains = tuple(tuple(i - 1 for i in joints) for _, joints in self.chains)
+            slides = tuple(i in prismatic for i in range(1, self.joints + 1))
+            kinds = JointKinds(slides, (*following, *still), chains)
         corrected = (self.coefficients, self.gravity, self.corrections)
         return Geometry(self.alpha, self.a, self.d, self.theta, self.beta, self.probe, kinds, *corrected)
 
@@ -169,7 +194,8 @@ class Arm(eqx.Module):
         """
         names = parameter_names(self) if names is None else (names,) if isinstance(names, str) else names
         joints, corrections = self.joints, correction_names(self)
-        indices = tuple(located(joints, corrections, name, extra=("q",)) for name in items_of(names, "names"))
+        names = items_of(names, "names")
+        indices = tuple(located(joints, corrections, name, tips_of(self), extra=("q",)) for name in names)
         return _evaluated(partial(tip_jacobian, indices=indices), self, q)
 
     def replace(self, **changes: Any) -> "Arm":
@@ -212,6 +238,12 @@ def checked_readings(arm: Arm, q: Numbers, like: AnyArray | None = None) -> Floa
     return array
 
 
+def with_chains(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m columns"]:
+    """Readings of all joints with the number of a chain, which take turns; those of an arm without chains as they
+    are."""
+    return np.column_stack([q, np.arange(len(q)) % len(arm.chains)]) if arm.chains else q
+
+
 def check_columns(arm: Arm, columns: int) -> None:
     """Raise `InputError` where readings of a capture have not the columns of an arm; without temperatures it was at
     20 C."""
@@ -227,25 +259,6 @@ def check_columns(arm: Arm, columns: int) -> None:
         )
 
 
-def checked_limits(limits: Limits, joints: int, prismatic: tuple[int, ...] = ()) -> tuple[tuple[float, float], ...]:
-    """Lowest and highest reading of each joint, rad or mm, or `InputError` that names the joint."""
-    try:
-        rows = [tuple(float(reading) for reading in row) for row in limits]
-    except (TypeError, ValueError):
-        rows = []  # no rows of numbers
-    if len(rows) != joints or any(len(row) != 2 for row in rows):
-        units = "rad (prismatic joints: mm)" if prismatic else "rad"
-        raise InputError(f"limits must be {pluralise(joints, 'row')} of (lowest, highest) in {units}, one per joint.")
-    for i, (low, high) in enumerate(rows, start=1):
-        if not -math.inf < low < high < math.inf:
-            reading = f"{low:g} to {high:g} {'mm' if i in prismatic else 'rad'}"
-            raise InputError(
-                f"limits of joint {i} are {reading}; both limits must be finite, and the lower limit below the "
-                "upper limit."
-            )
-    return tuple((low, high) for low, high in rows)
-
-
 def joint_limits(arm: Arm, limits: Limits | None) -> JointLimits:
     """Lowest and highest reading of each joint: those given, else the arm's own, else -pi to pi; rad, or mm.
     `InputError` where a prismatic joint has neither."""
@@ -257,14 +270,21 @@ def joint_limits(arm: Arm, limits: Limits | None) -> JointLimits:
                 "is not known; give the limits (limits=, or limits in the file of the arm)."
             )
         rows = [(-math.pi, math.pi)] * arm.joints
-    return np.asarray(checked_limits(rows, arm.joints, arm.prismatic))
+    return np.asarray(checked_limits(rows, arm.joints, arm.prismatic, arm.fixed))
 
 
 def arm_of(geometry: Geometry, limits: Limits | None = None) -> Arm:
     """The arm of a geometry."""
-    prismatic = () if geometry.kinds is None else geometry.kinds.prismatic
+    kinds, facts = geometry.kinds, {}
+    if kinds is not None:
+        facts = {
+            "prismatic": [i for i, slides in enumerate(kinds.prismatic, start=1) if slides],
+            "fixed": [i + 1 for i, source, _, _ in kinds.followers if i == source],
+            "mimic": [(i + 1, source + 1, *rest) for i, source, *rest in kinds.followers if i != source],
+            "chains": [(str(c), [i + 1 for i in joints]) for c, joints in enumerate(kinds.chains, start=1)],
+        }
     arrays = {name: value for name, value in geometry._asdict().items() if name != "kinds"}
-    return Arm(**arrays, limits=limits, prismatic=[i for i, slides in enumerate(prismatic, start=1) if slides])
+    return Arm(**arrays, limits=limits, **facts)
 
 
 def by_joint(arm: Arm, angular: Any, linear: Any) -> list[Any]:
@@ -301,7 +321,22 @@ def parameter_names(arm: Arm) -> tuple[str, ...]:
     """
     kinds, numbers = ("alpha", "a", "d", "theta") + (() if arm.beta is None else ("beta",)), range(1, arm.joints + 1)
     of_joints = [f"{kind}_{i}" for kind in kinds for i in numbers]
-    return (*of_joints, *(f"probe_{axis}" for axis in _AXES), *correction_names(arm))
+    return (*of_joints, *probe_names(tips_of(arm)), *correction_names(arm))
+
+
+@lru_cache
+def _tips_annotation(tips: int) -> Any:
+    return Float[Array, f"... {3 * tips}"]
+
+
+def tips_of(arm: Arm) -> int:
+    """Number of tips: one, or one of each chain of a robot."""
+    return max(1, len(arm.chains))
+
+
+def probe_names(tips: int) -> list[str]:
+    """Names of the coordinates of the tips: ``probe_x|y|z`` of the first, ``probe2_x`` of the second."""
+    return [f"probe{'' if tip == 1 else tip}_{axis}" for tip in range(1, tips + 1) for axis in _AXES]
 
 
 def correction_names(arm: Arm) -> tuple[str, ...]:
@@ -315,27 +350,32 @@ def correction_names(arm: Arm) -> tuple[str, ...]:
 
 def locate(arm: Arm, name: str) -> tuple[str, int]:
     """Kind and 0-based index of a parameter name: ``d_3 -> ("d", 2)``; an `InputError` names the nearest spelling."""
-    return located(arm.joints, correction_names(arm), name)
+    return located(arm.joints, correction_names(arm), name, tips_of(arm))
 
 
-def located(joints: int, corrections: tuple[str, ...], name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:
-    """`locate` for an arm with so many joints and corrections of these names."""
+def located(
+    joints: int, corrections: tuple[str, ...], name: str, tips: int = 1, extra: tuple[str, ...] = ()
+) -> tuple[str, int]:
+    """`locate` for an arm with so many joints, corrections of these names, and so many tips."""
     kinds = ("alpha", "a", "d", "theta", "beta", *extra)
     kind, _, index = name.rpartition("_") if isinstance(name, str) else ("", "", "")
     if (kind == "probe" or name in corrections) and index in _AXES:
         return kind, _AXES.index(index)
+    if tips > 1 and name in (probes := probe_names(tips)):
+        return "probe", probes.index(name)
     if name in corrections:
         return "coefficients", corrections.index(name)
     if kind in kinds and index.isdecimal() and str(int(index)) == index and 1 <= int(index) <= joints:
         return kind, int(index) - 1
-    names = [*(f"{k}_{i}" for k in kinds for i in range(1, joints + 1)), *(f"probe_{axis}" for axis in _AXES)]
+    names = [*(f"{k}_{i}" for k in kinds for i in range(1, joints + 1)), *probe_names(tips)]
     given = name if isinstance(name, str) else shown(name)
     raise InputError(f"unknown parameter '{given}' of a {joints}-joint arm{nearest(given, [*names, *corrections])}")
 
 
 def is_length(name: str) -> bool:
     """Whether a parameter name is a length (a, d, probe) and not an angle."""
-    return name.rpartition("_")[0] in LENGTHS
+    kind = name.rpartition("_")[0]
+    return kind in LENGTHS or (kind.startswith("probe") and kind[5:].isdecimal())
 
 
 def parameter_unit(arm: Arm, name: str) -> str:

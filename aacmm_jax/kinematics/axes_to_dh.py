@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import InputError
-from .arm import Arm, arm_of
+from .arm import NEARLY_PARALLEL, Arm, arm_of
 from .chain import Geometry
-from .independence import NEARLY_PARALLEL
 
 Vector = Float[np.ndarray, " 3"]
 Transform = Float[np.ndarray, "4 4"]
@@ -55,7 +54,7 @@ def same_transform(first: Transform, second: Transform) -> bool:
     return bool(difference[:3, 3].max() <= length and difference[:3, :3].max() <= angle)
 
 
-def _link(theta: float, d: float, a: float, alpha: float, beta: float) -> Transform:
+def dh_link(theta: float, d: float, a: float, alpha: float, beta: float) -> Transform:
     """Rz(theta) Tz(d) Tx(a) Rx(alpha) Ry(beta); mm and rad."""
     link = rotation(2, theta) @ rotation(0, alpha) @ rotation(1, beta)
     link[:3, 3] = a * math.cos(theta), a * math.sin(theta), d
@@ -72,7 +71,7 @@ def dh_frames(geometry: Geometry, base: Transform) -> list[Transform]:
     """The D-H frames 0 to n of one arm at reading 0; ``base`` is frame 0."""
     frames = [base]
     for row in _links(geometry):
-        frames.append(frames[-1] @ _link(*row))
+        frames.append(frames[-1] @ dh_link(*row))
     return frames
 
 
@@ -112,7 +111,7 @@ def dh_of_axes(axes: Axes, *, keep_points: bool = True) -> tuple[Transform, Geom
     for direction, point in zip(axes.directions[1:], axes.points[1:], strict=True):
         point = frame[:3, :3].T @ (point - frame[:3, 3])
         rows.append(_to_axis(frame[:3, :3].T @ direction, point, keep_points))
-        frame = frame @ _link(*rows[-1])
+        frame = frame @ dh_link(*rows[-1])
     row, probe = _to_frame(inverse(frame) @ axes.tip)
     theta, d, a, alpha, beta = np.array([*rows, row]).T
     return base, Geometry(alpha, a, d, theta, beta if np.any(beta) else None, probe)
@@ -242,6 +241,6 @@ def canonical_origins(geometry: Geometry) -> list[Transform]:
     """
     origins, link = [], np.eye(4)
     for theta, d, a, alpha, beta in _links(geometry):
-        origins.append(link @ _link(theta, d, 0.0, 0.0, 0.0))
-        link = _link(0.0, 0.0, a, alpha, beta)
+        origins.append(link @ dh_link(theta, d, 0.0, 0.0, 0.0))
+        link = dh_link(0.0, 0.0, a, alpha, beta)
     return [*origins, _with_probe(link, geometry)]

@@ -37,12 +37,16 @@ _UNIT = 1000.0  # mm: a slide of 1 mm counts as much as a rotation of 1 mrad, li
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class JointKinds:
-    """Which joints of a chain are prismatic: a node without leaves, so that it is static in every program.
+    """Which joints are prismatic, fixed or follow another, and which chains they form: static in every program.
 
-    A chain of revolute joints has None in its place: its programs are then those without the terms of prismatic joints.
+    A single chain of revolute joints has None in its place: its programs are then those without such terms.
     """
 
     prismatic: tuple[bool, ...]
+    # Joints without a reading of their own, from 0: the joint, the one that it follows, the factor, and an offset (rad,
+    # mm). Fixed joints have the factor 0.
+    followers: tuple[tuple[int, int, float, float], ...] = ()
+    chains: tuple[tuple[int, ...], ...] = ()  # joints of each chain of a robot, from 0; none of an arm
 
     @property
     def units(self) -> Float[np.ndarray, " n"]:
@@ -52,6 +56,30 @@ class JointKinds:
     def mask(self, rank: int = 1) -> Bool[np.ndarray, "n ..."]:
         """Whether each joint is prismatic, with axes of length 1 after the first up to the given rank."""
         return np.asarray(self.prismatic).reshape(-1, *(1,) * (rank - 1))
+
+    @cached_property
+    def by_reading(self) -> Float[np.ndarray, "n n"]:
+        """How much each joint moves with each reading; joints that follow others have no reading of their own."""
+        matrix = np.eye(len(self.prismatic))
+        for joint, source, factor, _ in self.followers:
+            matrix[joint] = factor * matrix[source]
+        return matrix
+
+    @property
+    def read(self) -> Float[np.ndarray, " n"]:
+        """1 for joints that have a reading of their own, 0 for those that follow others."""
+        return np.isin(np.arange(len(self.prismatic)), [joint for joint, *_ in self.followers], invert=True).astype(
+            float
+        )
+
+    @cached_property
+    def members(self) -> Float[np.ndarray, "c m"]:
+        """1 where a joint, and after the joints a coordinate of the tips, is of a chain."""
+        table = np.zeros((len(self.chains), len(self.prismatic) + 3 * len(self.chains)))
+        for number, joints in enumerate(self.chains):
+            first = len(self.prismatic) + 3 * number
+            table[number, [*joints, first, first + 1, first + 2]] = 1.0
+        return table
 
 
 @jax.tree_util.register_static
@@ -146,7 +174,7 @@ class Geometry(NamedTuple):
     d: Float[AnyArray, "... n"]
     theta: Float[AnyArray, "... n"]
     beta: Float[AnyArray, "... n"] | None  # Hayati's angle; None where it is unused
-    probe: Float[AnyArray, "... 3"]
+    probe: Float[AnyArray, "... 3"]  # of several chains one after the other
     kinds: JointKinds | None = None
     coefficients: Float[AnyArray, "... k"] | None = None  # of the corrections' functions
     gravity: Float[AnyArray, "... 3"] | None = None  # its direction in the base frame
@@ -157,13 +185,15 @@ class JointMotion(NamedTuple):
     """What readings do to the joints: all that the chain needs of them, evaluated once a capture.
 
     A revolute joint rotates by its reading, a prismatic one slides by it along its axis. ``slide`` is None for a chain
-    of revolute joints, ``functions`` for one without corrections.
+    of revolute joints, ``functions`` for one without corrections. Of a robot with several chains, ``members`` is 1
+    where a joint, and after the joints a coordinate of the tips, is of the chain of a pose, else 0.
     """
 
     cos: Float[AnyArray, "n ... 1 N"]
     sin: Float[AnyArray, "n ... 1 N"]
     slide: Float[AnyArray, "n ... 1 N"] | None  # mm
     functions: Float[AnyArray, "rows ... 1 N"] | None = None  # of the corrections
+    members: Float[AnyArray, "m ... 1 N"] | None = None
 
 
 class ForwardPass(NamedTuple):
@@ -181,6 +211,7 @@ class ForwardPass(NamedTuple):
     origin: ByJoint
     kinds: JointKinds | None = None
     errors: JointErrors | None = None  # of a chain with corrections
+    members: Float[AnyArray, "m ... 1 N"] | None = None  # of several chains
 
 
 def joints_first(values: Any, rank: int) -> Any:
@@ -204,10 +235,35 @@ def beside_joints(joints: int, columns: int) -> tuple[slice, slice]:
     return slice(joints, joints + torques), slice(joints + torques, joints + torques + 1)
 
 
-def of_joints(geometry: Geometry, rows: Float[AnyArray, "columns ..."]) -> Float[AnyArray, "n ..."]:
-    """The readings of the joints alone, which come first, without torques and temperature."""
-    joints = geometry.alpha.shape[-1]
-    return rows if rows.shape[0] == joints else rows[:joints]
+def of_joints(
+    geometry: Geometry, rows: Float[AnyArray, "columns ..."], offset: float = 1.0
+) -> Float[AnyArray, "n ..."]:
+    """The readings of the joints alone, which come first, without torques and temperature: of joints without one, what
+    the joint that they follow says. ``offset`` 0 for changes of the readings."""
+    joints, kinds = geometry.alpha.shape[-1], geometry.kinds
+    readings = rows if rows.shape[0] == joints else rows[:joints]
+    if kinds is None or not kinds.followers:
+        return readings
+    offsets = np.zeros((joints, *(1,) * (rows.ndim - 1)))
+    for joint, _, _, zero in kinds.followers:
+        offsets[joint] = offset * zero
+    return namespace(rows).tensordot(kinds.by_reading, readings, axes=1) + offsets
+
+
+def _members(geometry: Geometry, rows: Float[AnyArray, "columns ..."]) -> Float[AnyArray, "m ..."] | None:
+    """`JointMotion.members`, from the column after the joints of a robot: the number of a pose's chain, from 0."""
+    if geometry.kinds is None or not geometry.kinds.chains:
+        return None
+    xp, chain = namespace(rows), rows[geometry.alpha.shape[-1]]
+    return xp.moveaxis(xp.asarray(geometry.kinds.members)[chain.astype(int)], -1, 0)
+
+
+def tips_at(geometry: Geometry, q: Float[AnyArray, "N columns"]) -> Float[AnyArray, "... 3"]:
+    """The probe of an arm, or that of each pose's chain ``(N, 3)``, in its last frame, mm."""
+    if geometry.kinds is None or not geometry.kinds.chains:
+        return geometry.probe
+    chain = q[:, geometry.alpha.shape[-1]].astype(int)
+    return geometry.probe.reshape(*geometry.probe.shape[:-1], -1, 3)[..., chain, :]
 
 
 def joint_motion(geometry: Geometry, q: Float[AnyArray, "... n"]) -> JointMotion:
@@ -223,21 +279,28 @@ def joint_motion(geometry: Geometry, q: Float[AnyArray, "... n"]) -> JointMotion
 def joint_motion_of_rows(geometry: Geometry, rows: Float[AnyArray, "n ... 1 N"]) -> JointMotion:
     """`joint_motion` of readings that have the joints first and the configurations last."""
     corrections = geometry.corrections
-    xp, readings = namespace(rows, corrections), of_joints(geometry, rows)
+    xp, readings, members = namespace(rows, corrections), of_joints(geometry, rows), _members(geometry, rows)
+    chain = rows[len(readings) : len(readings) + 1]
+    moving = readings if members is None else readings * members[: len(readings)]
     if geometry.kinds is None:
         motion = JointMotion(xp.cos(readings), xp.sin(readings), None)
     else:
         prismatic = geometry.kinds.mask(rows.ndim)
-        angle = xp.where(prismatic, 0.0, readings)
-        motion = JointMotion(xp.cos(angle), xp.sin(angle), xp.where(prismatic, readings, 0.0))
+        angle = xp.where(prismatic, 0.0, moving)
+        slide = xp.where(prismatic, moving, 0.0) if any(geometry.kinds.prismatic) else None
+        motion = JointMotion(xp.cos(angle), xp.sin(angle), slide, members=members)
     if corrections is None:
         return motion
+    if geometry.kinds is not None and (geometry.kinds.followers or geometry.kinds.chains):
+        rows = xp.concatenate([readings, rows[len(readings) + (members is not None) :]])
     functions, moved = corrections.functions, motion
     if functions.couplings and np.any(functions.by_gravity):
         # Where a reading moves another joint by as much as its own, the frames at the readings alone are far off.
         whole = full_couplings(functions, joints_first(geometry.coefficients, rows.ndim - 2))
         nominal = geometry._replace(coefficients=None, gravity=None, corrections=None)
-        moved = joint_motion_of_rows(nominal, coupled_joints(functions, whole, readings))
+        coupled = coupled_joints(functions, whole, readings)
+        coupled = coupled if members is None else xp.concatenate([coupled, chain])
+        moved = joint_motion_of_rows(nominal, coupled)
     return motion._replace(functions=functions.values(rows, forward_pass(corrections.nominal, moved)))
 
 
@@ -302,11 +365,15 @@ def _joints_first(geometry: Geometry, motion: JointMotion) -> tuple[Geometry, Jo
 def _forward_pass(geometry: Geometry, motion: JointMotion, loop: Callable) -> ForwardPass:
     xp = namespace(geometry, motion)
     parameters, motion = _joints_first(geometry, motion)
+    if motion.members is not None:
+        parameters = _of_chains(parameters, motion.members)
     theta, d, a, probe, errors = parameters.theta, parameters.d, parameters.a, parameters.probe, None
     if motion.slide is not None:
         d = d + motion.slide
     if geometry.corrections is not None:
         errors = _errors_of(parameters, motion)
+        if motion.members is not None:
+            errors = errors._replace(added=errors.added * motion.members[: len(errors.added)])
         if geometry.kinds is None:
             theta = theta + errors.added
         else:
@@ -344,7 +411,19 @@ def _forward_pass(geometry: Geometry, motion: JointMotion, loop: Callable) -> Fo
     x, y, z = (xp.broadcast_to(axis.reshape((1,) * len(batch[:-2]) + (3, 1)), shape) for axis in xp.eye(3))
     (frame, origin), axes = loop(joint, ((x, y, z), xp.zeros(shape)), inputs)
     tip = origin + probe[0] * frame[0] + probe[1] * frame[1] + probe[2] * frame[2]
-    return ForwardPass(frame, tip, *axes, kinds=geometry.kinds, errors=errors)
+    return ForwardPass(frame, tip, *axes, kinds=geometry.kinds, errors=errors, members=motion.members)
+
+
+def _of_chains(parameters: Geometry, members: Float[AnyArray, "m ... 1 N"]) -> Geometry:
+    """The parameters of the chain of each pose, with the joints first: joints of other chains do not move anything."""
+    joints = len(parameters.theta)
+    of_joints, probe = members[:joints], parameters.probe
+    rows = {kind: getattr(parameters, kind) for kind in ("alpha", "a", "d", "theta", "beta")}
+    masked = {kind: None if values is None else values * of_joints for kind, values in rows.items()}
+    if len(probe) > 3:  # else that of the target that each pose held
+        each = probe * members[joints:]
+        probe = each.reshape(len(each) // 3, 3, *each.shape[1:]).sum(axis=0)
+    return parameters._replace(**masked, probe=probe)
 
 
 def _errors_of(parameters: Geometry, motion: JointMotion) -> JointErrors:

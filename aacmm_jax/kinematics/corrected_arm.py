@@ -88,6 +88,8 @@ def _determined(arm: Arm, terms: Sequence[Term], gravity: Float[np.ndarray, " 3"
     if any(term.kind.of_torque for term in terms):
         torques = np.random.default_rng(1).uniform(*_TORQUES, (_CONFIGURATIONS, arm.joints))
         q = np.concatenate([q[:, :-1], torques, q[:, -1:]], axis=1)
+    if arm.chains:
+        q = np.insert(q, arm.joints, np.arange(len(q)) % len(arm.chains), axis=1)
     values, chosen = function_values(arm.geometry, terms, q, gravity), []
     constant = np.full((_CONFIGURATIONS, 1), _CONFIGURATIONS**-0.5)
     for joint in range(arm.joints + 1):  # 0: functions that scale all lengths
@@ -102,7 +104,9 @@ def function_values(
 ) -> Float[np.ndarray, "k N"]:
     """The function of each term at N configurations, in units of its coefficient's effect (rad, or mm)."""
     functions = KnownFunctions(tuple(terms))
-    rows = functions.values(joints_first(q, 1), forward_pass(nominal, joint_motion(nominal, q)))[:, 0]
+    chains = nominal.kinds is not None and nominal.kinds.chains
+    beside = joints_first(np.delete(q, nominal.alpha.shape[-1], axis=1) if chains else q, 1)
+    rows = functions.values(beside, forward_pass(nominal, joint_motion(nominal, q)))[:, 0]
     weight = np.concatenate([gravity if by_gravity else [1.0] for by_gravity in functions.by_gravity])
     return np.add.reduceat(weight[:, None] * rows, functions.first_row)
 

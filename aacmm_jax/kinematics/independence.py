@@ -31,6 +31,7 @@ from ..core.linear_algebra import independent_columns
 from ..core.numpy_or_jax import in_chunks
 from ..core.text import listed
 from .arm import (
+    NEARLY_PARALLEL,
     Arm,
     JointLimits,
     check_columns,
@@ -40,12 +41,15 @@ from .arm import (
     joint_limits,
     natural_steps,
     neighbouring_arm,
+    probe_names,
+    tips_of,
     with_arrays,
+    with_chains,
 )
 from .corrections import unit_of_coefficient
 from .inverse_kinematics import SocketPoses, project_to_centroids, project_to_targets
+from .robots import chains_of, mount_names
 
-NEARLY_PARALLEL = 0.02  # |sin alpha|, about 1 degree
 LEAST_MOVEMENT = 2e-3  # mm at the tips per natural step
 SHARE_OF_BOUNDS = 0.5  # of a half-width, that a standard uncertainty may reach
 _OFF_AXIS = 5.0  # mm
@@ -97,7 +101,7 @@ def _determining(
     lengths = np.zeros((0, len(names)))
     if capture.sizes:
         *blocks, lengths = equations(arm, capture, names, q)
-    for observed in capture.observations:
+    for observed in _with_common_frames(capture.observations) if arm.chains else capture.observations:
         readings = change(observed.q)
         tips, columns = np.asarray(arm.position(readings)), jacobian_at(arm, readings, names)
         # A frame that is not known imitates motions of the whole arm, a scale all tips, a target its probe. What these
@@ -106,12 +110,32 @@ def _determining(
         if not observed.fixes_scale:
             unknown.append(tips[:, :, None] * 1e-3)
         if observed.target:
-            unknown.append(jacobian_at(arm, readings, ("probe_x", "probe_y", "probe_z")))
+            unknown.append(jacobian_at(arm, readings, probe_names(tips_of(arm))))
         rows = columns.reshape(-1, len(names))
         basis, sizes, _ = np.linalg.svd(np.concatenate(unknown, axis=2).reshape(len(rows), -1), full_matrices=False)
         basis = basis[:, sizes > 1e-10 * sizes[0]]
         blocks.append((rows - basis @ (basis.T @ rows)).reshape(columns.shape))
     return np.concatenate(blocks), lengths
+
+
+def _with_common_frames(observations: Sequence[Any]) -> list[Any]:
+    """Observations of a robot, those that have some unknown geometry in common as one: in the frame of one instrument
+    they say where the bases of two chains are."""
+    groups: list[tuple[set[str], list[Any]]] = []
+    for observation in observations:
+        names = {name for name in observation.unknowns if not name.startswith("offset of ")}
+        joined = [group for group in groups if group[0] & names]
+        groups = [group for group in groups if group not in joined]
+        members = [member for _, some in joined for member in some]
+        groups.append((names.union(*(some for some, _ in joined)), [*members, observation]))
+    return [
+        SimpleNamespace(
+            q=np.concatenate([np.asarray(member.q) for member in members]),
+            fixes_scale=any(member.fixes_scale for member in members),
+            target=any(member.target for member in members),
+        )
+        for _, members in groups
+    ]
 
 
 def _independent(order: list[str], rows: Float[np.ndarray, "r p"]) -> tuple[str, ...]:
@@ -128,7 +152,7 @@ def determined_at(
     readings of them. Tips that do not meet in their socket then are no matter: what imitates what stays the same."""
 
     def changed(q: Any) -> Readings:
-        return change(np.array(q)[:, : arm.joints])
+        return change(np.array(q)[:, : arm.joints + bool(arm.chains)])
 
     poses, lengths = _determining(arm, capture, order, changed(capture.q) if capture.sizes else None, changed)
     return _independent(list(order), np.concatenate([poses.reshape(-1, len(order)), lengths]))
@@ -136,6 +160,9 @@ def determined_at(
 
 def nearly_parallel(arm: Arm) -> list[int]:
     """Joints, from 1, whose axis is nearly parallel to the next, where D-H is singular (Hayati and Mirmirani 1985)."""
+    if arm.chains:
+        pairs = [(chain, i) for chain in chains_of(arm).values() for i in nearly_parallel(chain.arm)]
+        return sorted({int(chain.names[f"d_{i}"].rpartition("_")[2]) for chain, i in pairs})
     return [i + 1 for i in range(arm.joints - 1) if abs(np.sin(float(arm.alpha[i]))) < NEARLY_PARALLEL]
 
 
@@ -178,11 +205,20 @@ def _order(arm: Arm, parallel: list[int]) -> list[str]:
     Nonzero lengths come first, then angles, lengths that are nominally zero, the probe and the last link. Before the
     longest link come the coefficients of corrections, since a harmonic may imitate a zero offset, but not replace it;
     the longest link is last of all, so that it is fixed where neither a reference length, another observation nor a
-    prismatic joint fixes the scale. Where neighbouring axes are nearly parallel, ``d_i`` is fixed and ``beta_i`` is
+    prismatic joint fixes the scale. The orders of a robot's chains are merged, after the parameters of bases. Where
+    neighbouring axes are nearly parallel, ``d_i`` is fixed and ``beta_i`` is
     free. Of a prismatic joint i, ``a_i`` and ``d_(i+1)`` are fixed rather than others, and ``theta_i`` next to a
     parallel axis: three angles and ``theta`` of the joint before it, or after it, are all that the orientation of the
     next axis has.
     """
+    if arm.chains:
+        ranks: dict[str, float] = {}
+        for chain in chains_of(arm).values():
+            own = _order(chain.arm, nearly_parallel(chain.arm))
+            for rank, name in enumerate(own, start=1):
+                ranks.setdefault(chain.names[name], rank / len(own))
+        bases = [name for chain in chains_of(arm).values() for name in mount_names(chain)]
+        return [*bases, *sorted(ranks, key=ranks.__getitem__)]
     n, (x, y, z) = arm.joints, np.asarray(arm.probe)
     values = {kind: np.asarray(getattr(arm, kind)) for kind in ("a", "d")}
     pairs = [(kind, i) for i in range(1, n) for kind in ("a", "d") if kind == "a" or i not in parallel]
@@ -219,6 +255,11 @@ def generic_poses(arm: Arm, limits: JointLimits | None = None) -> SocketPoses:
     """
     random = np.random.default_rng(0)
     limits = np.asarray(joint_limits(arm, None)) if limits is None else limits
+    if arm.chains:  # positions of all tips in one frame
+        q = random.uniform(limits[:, 0], limits[:, 1], (_SOCKETS * _STARTS, arm.joints))
+        q = with_chains(arm, q)
+        seen = SimpleNamespace(q=q, unknowns={"frame": ()}, fixes_scale=True, target="")
+        return SimpleNamespace(q=q[:0], columns=q.shape[1], sizes=(), owner=(), observations=(seen,), ends=None)
     first = random.uniform(limits[:, 0], limits[:, 1], (_SOCKETS, arm.joints))
     owner = np.repeat(np.arange(_SOCKETS), _STARTS)
     starts = random.uniform(limits[:, 0], limits[:, 1], (len(owner), arm.joints))

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..core.arrays import Numbers, as_array
 from ..core.errors import InputError
@@ -96,7 +96,8 @@ def solve_to_targets(
 
     Args:
         geometry: The arm's ``geometry``.
-        q: Joint readings to begin with ``(c, n)``, rad, or mm of prismatic joints.
+        q: Joint readings to begin with ``(c, n)``, rad, or mm of prismatic joints; of a robot with the number of the
+            chain, ``(c, n + 1)``.
         targets: Positions of the tip, one each ``(c, 3)``, mm.
         limits: Lowest and highest reading of each joint ``(n, 2)``, rad or mm.
         steps: Most steps.
@@ -109,6 +110,7 @@ def solve_to_targets(
         [[ 100.  150. -100.]] True
     """
     xp, low, high = namespace(geometry, q, targets), limits[:, 0, None, None], limits[:, 1, None, None]
+    joints = geometry.alpha.shape[-1]
     largest = LARGEST_STEP * xp.asarray(reading_units(geometry))[:, None, None]
 
     def step(q: Any, wanted: Any) -> tuple[Any, Any]:
@@ -116,7 +118,10 @@ def solve_to_targets(
         gap = wanted - forward.tip
         inverse = weighted_inverse(forward, 1e-2 * xp.sum(gap**2, axis=0) + 1e-12)
         change = xp.sum(inverse * gap[None], axis=1, keepdims=True)
-        return xp.clip(q + xp.clip(change, -largest, largest), low, high), xp.any(xp.abs(gap) > EXACT, axis=0)
+        moved = xp.clip(q[:joints] + xp.clip(change, -largest, largest), low, high)
+        if q.shape[0] > joints:  # the number of a robot's chain
+            moved = xp.concatenate([moved, q[joints:]])
+        return moved, xp.any(xp.abs(gap) > EXACT, axis=0)
 
     # The step after the gap was seen to be closed takes what Newton's method leaves to rounding.
     q = repeated(step, q.T[:, None, :], [targets.T], steps, together=True)
@@ -163,12 +168,14 @@ def random_configurations(
     key: Array,
     limits: Float[AnyArray, "n 2"],
     labels: Sequence[str] | None = None,
+    chain: Int[np.ndarray, " m"] | None = None,
 ) -> Float[AnyArray, "m n"]:
-    """One random configuration for each target, within the limits, exact to 1e-9 mm; `InputError`, with the target's
-    label, if none is found."""
+    """One random configuration for each target, within the limits, exact to 1e-9 mm, of a robot with the number of the
+    ``chain`` that is there; `InputError`, with the target's label, if none is found."""
     arm, targets, limits = to_numpy((arm, targets, limits))
     count = targets.shape[0]
-    q, missing = np.zeros((count, arm.joints)), np.arange(count)
+    beside = np.zeros((count, 0)) if chain is None else chain[:, None].astype(float)
+    q, missing = np.hstack([np.zeros((count, arm.joints)), beside]), np.arange(count)
     for round_number in range(_ROUNDS * (1 + count // _BATCH)):
         if not len(missing):
             return q
@@ -176,6 +183,7 @@ def random_configurations(
         tried = np.resize(missing, _BATCH)
         key_of_round = jax.random.fold_in(key, round_number)
         start = limits[:, 0] + random_numbers("uniform", key_of_round, (_BATCH, arm.joints)) * np.ptp(limits, axis=1)
+        start = np.hstack([start, beside[tried]])
         solved, distance = solve_to_targets(*to_numpy((arm.geometry, start, targets[tried], limits)))
         successes = np.flatnonzero(distance <= _TOLERANCE)[::-1]
         q[tried[successes]] = solved[successes]
@@ -220,7 +228,8 @@ def project_to_targets(
         return np.column_stack(solve_to_targets(geometry, rows[:, :-3], rows[:, -3:], allowed, steps))
 
     # An arm that has expanded is at the target where the arm at 20 C is at the target divided by the scale of lengths.
-    joints, temperature = q[:, : arm.joints], q[:, arm.joints :]
+    moving = arm.joints + bool(arm.chains)
+    joints, temperature = q[:, :moving], q[:, moving:]
     solved = in_chunks(moved, np.hstack([joints, targets / length_scale(geometry, q)[:, None]]), ROWS)
     return np.hstack([solved[:, :-1], temperature]), solved[:, -1] <= ARRIVED
 

@@ -54,11 +54,27 @@ def _column(forward: ForwardPass, kind: str, at: int | slice) -> Vectors:
     tip = forward.tip if isinstance(at, int) else forward.tip[None]
     if kind in _ROTATIONS:
         axis, origin = (getattr(forward, name)[at] for name in _ROTATIONS[kind])
-        return cross(axis, tip - origin)
-    axis = namespace(tip).stack(forward.frame)[at] if kind == "probe" else getattr(forward, _SLIDES[kind])[at]
+        return _of_chain(cross(axis, tip - origin), forward, at)
+    if kind == "probe":
+        axis = _of_chain(namespace(tip).stack(forward.frame * _tips(forward))[at], forward, at, len(forward.x))
+    else:
+        axis = _of_chain(getattr(forward, _SLIDES[kind])[at], forward, at)
     if forward.errors is None or forward.errors.scale is None:
         return axis
     return axis * (forward.errors.scale if isinstance(at, int) else forward.errors.scale[None])  # lengths expand
+
+
+def _tips(forward: ForwardPass) -> int:
+    """Number of chains, each with a tip."""
+    return 1 if forward.kinds is None else max(1, len(forward.kinds.chains))
+
+
+def _of_chain(columns: Vectors, forward: ForwardPass, at: int | slice, first: int = 0) -> Vectors:
+    """Derivatives by joints, or by coordinates of tips, which come after the joints: 0 for those of other chains."""
+    if forward.members is None:
+        return columns
+    at = slice(first or None, None if first else len(forward.x)) if isinstance(at, slice) else first + at
+    return columns * forward.members[at]
 
 
 def _columns(forward: ForwardPass, kind: str) -> Float[AnyArray, "k ... 3 N"]:
@@ -97,7 +113,8 @@ def joint_rotations(forward: ForwardPass) -> ByJoint:
     """Derivative of the last frame's orientation, as a rotation vector, by every joint."""
     if forward.kinds is None:
         return forward.z_before
-    return namespace(forward).where(forward.kinds.mask(forward.z_before.ndim), 0.0, forward.z_before)
+    rotations = namespace(forward).where(forward.kinds.mask(forward.z_before.ndim), 0.0, forward.z_before)
+    return _of_chain(rotations, forward, _ALL)
 
 
 def reading_columns(forward: ForwardPass) -> ByJoint:
@@ -117,6 +134,8 @@ def reading_rotations(forward: ForwardPass) -> ByJoint:
 
 def _by_readings(forward: ForwardPass, by_joint: ByJoint) -> ByJoint:
     """Derivatives by readings, from those by joints."""
+    if forward.kinds is not None and forward.kinds.followers:
+        by_joint = namespace(by_joint).tensordot(forward.kinds.by_reading.T, by_joint, axes=1)
     if forward.errors is None or forward.errors.couplings is None:
         return by_joint
     columns = [by_joint[joint] for joint in range(by_joint.shape[0])]
@@ -147,7 +166,10 @@ def rotation_columns(forward: ForwardPass, indices: Indices) -> Columns:
     axes: dict[str, Any] = {kind: getattr(forward, axis) for kind, (axis, _) in _ROTATIONS.items()}
     for kind in {kind for kind, _ in wanted} & {"coefficients", "gravity"}:
         axes[kind] = _by_errors(forward, kind, joint_rotations(forward), still)
-    return _stacked([still if axes.get(kind) is None else axes[kind][i] for kind, i in wanted], forward)
+    columns = [still if axes.get(kind) is None else axes[kind][i] for kind, i in wanted]
+    of_joint = [kind in _ROTATIONS for kind, _ in wanted]
+    masked = zip(columns, wanted, of_joint, strict=True)
+    return _stacked([_of_chain(column, forward, i) if own else column for column, (_, i), own in masked], forward)
 
 
 def _stacked(columns: list[Vectors], forward: ForwardPass) -> Columns:
@@ -254,7 +276,7 @@ def _tip_position_jvp(primals, tangents):
         if not isinstance(tangent, SymbolicZero):
             moved = moved + jnp.sum(_columns(forward, kind) * joints_first(tangent, rank), axis=0)
     if not isinstance(q_dot, SymbolicZero):
-        moved = moved + jnp.sum(joint_columns(forward) * of_joints(geometry, joints_first(q_dot, rank)), axis=0)
+        moved = moved + jnp.sum(joint_columns(forward) * of_joints(geometry, joints_first(q_dot, rank), 0.0), axis=0)
         if geometry.corrections is not None:  # which change with the readings, and so does the scale of all lengths
             errors = lambda q: joint_errors(geometry, joint_motion(geometry, q))  # noqa: E731
             _, (by_joints, by_scale) = jax.jvp(errors, (q,), (q_dot,))
@@ -283,7 +305,9 @@ def tip_jacobian(geometry: Geometry, q: Float[AnyArray, "... n"], indices: Indic
     batched = max(leaf.ndim for leaf in jax.tree.leaves((geometry, q))) > 1
     columns = xp.moveaxis(columns if batched else columns[0], -2, -1)
     for place, (kind, i) in enumerate(indices):
-        if kind == "q" and geometry.corrections is not None:  # which change with the reading as well
+        # Corrections change with the reading as well, and joints may follow it.
+        follows = geometry.kinds is not None and geometry.kinds.followers
+        if kind == "q" and (follows or geometry.corrections is not None):
             unit = jnp.broadcast_to(jnp.eye(q.shape[-1])[i], q.shape)
             by_reading = jax.jvp(partial(_tip_position, geometry), (jnp.asarray(q),), (unit,))[1]
             columns = set_at(columns, (..., place), xp.asarray(by_reading))

@@ -25,6 +25,7 @@ from .arm import (
     located,
     natural_steps,
     parameter_names,
+    tips_of,
     with_arrays,
     with_values,
 )
@@ -33,6 +34,7 @@ from .independence import generic_poses, independent_names
 from .inverse_kinematics import SocketPoses
 from .jacobian import Indices
 from .priors import Prior
+from .robots import default_names, plain_held
 
 _HalfWidth = Annotated[float, Range(least=0, infinite=True)]
 
@@ -80,11 +82,11 @@ class Parameters(eqx.Module):
                 gravity are fixed unless in ``free``.
             free: Names that are free in addition, beta and gravity included.
         """
-        n, free = arm.joints, _unique_names(arm, free, "free")
+        free = _unique_names(arm, free, "free")
         if held is None:
-            held = {"theta_1", "d_1", f"a_{n}", f"alpha_{n}", "probe_x", "probe_y"}
-            held |= {f"a_{i}" for i in arm.prismatic} | {f"d_{i + 1}" for i in arm.prismatic if i < n}
-            held |= {f"theta_{n}", "probe_z"} if n in arm.prismatic else set()
+            usual = default_names(arm) if arm.chains else ()
+            held = set(parameter_names(arm)) - set(usual) if arm.chains else plain_held(arm)
+            free = tuple(dict.fromkeys((*free, *(name for name in usual if name.startswith("beta_")))))
             held = held - set(free)
         held = _unique_names(arm, held, "held")
         for name in free:
@@ -136,7 +138,7 @@ class Parameters(eqx.Module):
 
     def indices(self) -> Indices:
         """Kind and 0-based index of each free parameter."""
-        return _located(self.base.joints, correction_names(self.base), self.names)
+        return _located(self.base.joints, correction_names(self.base), self.names, tips_of(self.base))
 
     def index(self, name: str) -> int:
         """Position of a free parameter in the vector; raises `InputError` if it is not free."""
@@ -190,13 +192,13 @@ class Parameters(eqx.Module):
 
 
 @lru_cache(maxsize=256)
-def _located(joints: int, corrections: tuple[str, ...], names: tuple[str, ...]) -> Indices:
-    return tuple(located(joints, corrections, name) for name in names)
+def _located(joints: int, corrections: tuple[str, ...], names: tuple[str, ...], tips: int) -> Indices:
+    return tuple(located(joints, corrections, name, tips) for name in names)
 
 
 def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
     names = (names,) if isinstance(names, str) else tuple(names)
-    _located(arm.joints, correction_names(arm), names)
+    _located(arm.joints, correction_names(arm), names, tips_of(arm))
     for i, name in enumerate(names):
         if name in names[:i]:
             raise InputError(f"parameter '{name}' is given twice in {what}; give each parameter once.")

@@ -17,6 +17,7 @@ from .chain import ForwardPass, forward_pass, joint_motion, reading_units
 from .collisions import Cell, checked_cell, is_clear
 from .inverse_kinematics import ARRIVED, EXACT, LARGEST_STEP, ROWS, damped_inverse, project_to_targets, repeated
 from .jacobian import reading_columns, reading_rotations
+from .robots import chains_of
 
 TOOL_AXIS = (0.0, 0.0, 1.0)
 _STARTS, _SWEEPS = 256, 30
@@ -39,7 +40,8 @@ class Reach(NamedTuple):
 
 
 def arm_reach(arm: Arm) -> Reach:
-    """Largest distance of the tip from the shoulder within the joint limits.
+    """Largest distance of the tip from the shoulder within the joint limits; of a robot, a ball that contains those of
+    its chains.
 
     Args:
         arm: One arm.
@@ -52,7 +54,13 @@ def arm_reach(arm: Arm) -> Reach:
         >>> print(f"{reach.radius:.0f} mm")
         1359 mm
     """
-    return _extreme_distance(arm, farthest=True)
+    if not arm.chains:
+        return _extreme_distance(arm, farthest=True)
+    own = [(chain.base, _extreme_distance(chain.arm, farthest=True)) for chain in chains_of(arm).values()]
+    shoulders = np.array([base[:3, :3] @ reach.shoulder + base[:3, 3] for base, reach in own])
+    middle = shoulders.mean(axis=0)
+    beyond = np.linalg.norm(shoulders - middle, axis=1) + [reach.radius for _, reach in own]
+    return Reach(middle, float(beyond.max()))
 
 
 def closest_approach(arm: Arm) -> float:

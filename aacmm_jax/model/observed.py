@@ -21,7 +21,7 @@ from ..data.observations.held import platform_frames, position_of
 from ..data.observations.observation import AbstractObservation, Rows, Tips, offset_of
 from ..data.observations.reduced_rows import MOVED
 from ..kinematics.arm import Arm
-from ..kinematics.chain import Geometry, JointMotion, forward_pass, joint_motion
+from ..kinematics.chain import Geometry, JointMotion, forward_pass, joint_motion, tips_at
 from ..kinematics.parameters import Parameters
 from ..solver.arrow import split
 from .layout import Layout, layout_of, unknowns_of
@@ -172,7 +172,7 @@ class Observed:
             return arm
         xp, parts, probes = namespace(arm, geometry), self.split(geometry), []
         for observation in self.observations:
-            probe = parts[offset_of(observation.target)] if observation.target else arm.probe
+            probe = parts[offset_of(observation.target)] if observation.target else tips_at(arm, observation.q)
             probes.append(xp.broadcast_to(probe, (observation.q.shape[0], 3)))
         return arm._replace(probe=xp.concatenate(probes))
 
@@ -184,9 +184,10 @@ class Observed:
         tips = [tips_of(forward, rows) for rows in self.slices]
         parts: dict[str, Any] = {}
         for observation, tips_seen in zip(self.observations, tips, strict=True):
-            new = observation.start(tips_seen, arm.probe)
+            probe = tips_at(arm, observation.q[:1]).reshape(3)
+            new = observation.start(tips_seen, probe)
             if observation.target:
-                new = {offset_of(observation.target): arm.probe} | new
+                new = {offset_of(observation.target): probe} | new
             parts = new | parts  # what another observation says stays
         parts |= platform_frames(self.observations, tips)
         return namespace(arm, forward).concatenate([parts[name] for name in self.blocks])

@@ -19,6 +19,7 @@ from ..kinematics.arm import (
     joint_limits,
     neighbouring_arm,
     with_arrays,
+    with_chains,
 )
 from ..kinematics.chain import Geometry, joint_motion
 from ..kinematics.independence import (
@@ -324,7 +325,7 @@ class _Spectrum(NamedTuple):
         """Which directions move the tip, in any pose, only as a rigid motion of the whole arm, which no capture
         shows."""
         random = np.random.default_rng(0)
-        q = random.uniform(-np.pi, np.pi, (_CONFIGURATIONS, self.arm.joints))
+        q = with_chains(self.arm, random.uniform(-np.pi, np.pi, (_CONFIGURATIONS, self.arm.joints)))
         if self.arm.torques:
             q = np.concatenate([q, random.uniform(-100.0, 100.0, (_CONFIGURATIONS, self.arm.joints))], axis=1)
         if self.arm.thermometer:
@@ -352,7 +353,7 @@ class _Spectrum(NamedTuple):
         self, sockets: dict[str, Float[np.ndarray, "_ _"]], lengths: Sequence[ReferenceLength] = ()
     ) -> "_Spectrum":
         """With invented sockets, which have the first pose's torques and temperature where they have none."""
-        capture, joints = self.capture, self.arm.joints
+        capture, joints = self.capture, self.arm.joints + bool(self.arm.chains)
         beside, more = np.asarray(capture.readings)[:1, joints:], dict(capture.sockets)
         for name, q in sockets.items():
             more[name] = np.concatenate([q, np.repeat(beside, len(q), axis=0)], axis=1)[:, : capture.columns]
@@ -378,7 +379,8 @@ class _Spectrum(NamedTuple):
         arm, capture, random = self.arm, self.capture, np.random.default_rng(0)
         low, high = np.asarray(joint_limits(arm, None)).T
         # The zero byte keeps the invented sockets apart from those of the capture.
-        more_sockets = {f"\0{i}": row[None] for i, row in enumerate(random.uniform(low, high, (4, arm.joints)))}
+        more = with_chains(arm, random.uniform(low, high, (4, arm.joints)))
+        more_sockets = {f"\0{i}": row[None] for i, row in enumerate(more)}
         lengths = [ReferenceLength("\0000", "\0001", 1.0), ReferenceLength("\0002", "\0003", 1.0)]
         more_poses, warmer = {}, {}
         for name, q in capture.sockets.items():

@@ -1,0 +1,322 @@
+"""Robots of several chains: one arm with the joints of all chains, made of plain arms and divided into them again.
+
+Joints that chains have in common are the same rows of Denavit-Hartenberg parameters, so that their parameters are tied.
+A joint after which chains separate is a row of zeros: the link to each branch is the row of a fixed joint, with which
+the branch begins. The base of an arm that has no joint in common with the first one is carried by three fixed joints:
+
+    T = Tz(z) Tx(x)  Rz(pi/2) Tx(y) Rx(alpha') Ry(beta')  Rz(theta) Rx(alpha) Ry(beta)
+
+with x, y, z, theta and small angles alpha and beta free, and the other angles constant, so that all six freedoms of a
+base are determined, however the arm is mounted.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.arrays import Numbers, as_floats
+from ..core.errors import InputError, nearest
+from ..core.numpy_or_jax import to_numpy
+from .arm import Arm, joint_limits, parameter_names, probe_names, value_of
+from .axes_to_dh import Transform, dh_link, rotation
+
+_ROW = ("theta", "d", "a", "alpha", "beta")
+_SAME = 1e-9  # mm and rad: tied parameters that differ by more are different
+_MOUNT = (("d", "a"), ("a",), ("theta", "alpha", "beta"))  # the free parameters of the fixed joints below a base
+
+
+class ChainOf(NamedTuple):
+    """A chain of a robot as an arm of its own, and what is what: parameters, readings and base."""
+
+    arm: Arm
+    base: Transform  # its base in that of the robot, mm
+    number: int  # of the chain, from 0
+    joints: tuple[int, ...]  # of the robot, from 1: the joint whose reading each joint of the arm has
+    mount: tuple[int, ...]  # fixed joints of the robot that carry the base
+    names: Mapping[str, str]  # of the robot's parameter that each parameter of the arm is
+    columns: int  # of the robot's readings
+
+    def readings(self, q: Numbers) -> Float[np.ndarray, "N columns"]:
+        """The robot's readings, with the number of the chain, at readings of the chain ``(N, n)``; other joints at
+        0."""
+        given = np.atleast_2d(np.asarray(q, dtype=float))
+        if given.shape[-1] != len(self.joints):
+            raise InputError(f"q has {given.shape[-1]} columns, but the chain has {len(self.joints)} joints.")
+        whole = np.zeros((len(given), self.columns))
+        whole[:, np.array(self.joints) - 1], whole[:, -1] = given, self.number
+        return whole
+
+    def of_robot(self, q: Numbers) -> Float[np.ndarray, "N n"]:
+        """The readings of the chain among those of the robot."""
+        return np.asarray(q)[..., np.array(self.joints) - 1]
+
+
+def chain_of(robot: Arm, name: str) -> ChainOf:
+    """A chain of a robot as an arm of its own, which is exact.
+
+    Links that are fixed joints of the robot are part of the joint before them. `InputError` for a chain that does not
+    exist, and for joint corrections, which belong to the whole robot.
+
+    Args:
+        robot: An arm with chains.
+        name: Name of the chain.
+
+    Example:
+        >>> left, right = aj.Arm(alpha=[1.57, 0], a=[0, 300], d=[90, 0]), aj.Arm(alpha=[1.57, 0], a=[0, 200], d=[80, 0])
+        >>> robot = aj.kinematics.together({"left": left, "right": right}, bases={"right": (500, 0, 0)})
+        >>> chain = aj.kinematics.chain_of(robot, "right")
+        >>> print(chain.arm.a, chain.joints, chain.base[:3, 3])
+        [  0. 200.] (6, 7) [500.   0.   0.]
+    """
+    numbers = [chain for chain, _ in robot.chains]
+    if name not in numbers:
+        raise InputError(f"the robot has no chain '{name}'{nearest(str(name), numbers)}")
+    if robot.corrections is not None:
+        raise InputError("a chain of a robot with joint corrections is not an arm of its own; remove the corrections.")
+    number, (_, joints) = numbers.index(name), robot.chains[numbers.index(name)]
+    rows = _rows_of(robot)
+    start = next(place for place, joint in enumerate(joints) if joint not in robot.fixed)
+    base = np.eye(4)
+    for joint in joints[:start]:
+        base = base @ dh_link(*rows[joint - 1])
+    links, moving, owner = [], [], []
+    for joint in joints[start:]:
+        theta, d, a, alpha, beta = row = rows[joint - 1]
+        if joint in robot.fixed and not np.any(links[-1][2:]):
+            links[-1] = np.array([theta + links[-1][0], d + links[-1][1], a, alpha, beta])
+            owner[-1] = joint
+        else:
+            links.append(row)
+            moving.append(joint)
+            owner.append(joint)
+    place = {joint: i for i, joint in enumerate(moving, start=1)}
+    limits = None if robot.limits is None else np.array(robot.limits)[np.array(moving) - 1]
+    following = [row for row in robot.mimic if row[0] in place]
+    for joint, source, *_ in following:
+        if source not in place:
+            raise InputError(
+                f"joint {joint} of chain '{name}' mimics joint {source}, which is of another chain, so the chain "
+                "is not an arm of its own."
+            )
+    values = dict(zip(_ROW, np.array(links).T, strict=True))
+    arm = Arm(
+        **(values if robot.beta is not None else {kind: values[kind] for kind in _ROW[:-1]}),
+        probe=np.asarray(robot.probe)[3 * number : 3 * number + 3],
+        limits=limits,
+        prismatic=[place[joint] for joint in moving if joint in robot.prismatic],
+        fixed=[place[joint] for joint in moving if joint in robot.fixed],
+        mimic=[(place[joint], place[source], *rest) for joint, source, *rest in following],
+    )
+    kinds = _ROW if robot.beta is not None else _ROW[:-1]
+    names = {f"{kind}_{i}": f"{kind}_{joint}" for i, joint in enumerate(owner, start=1) for kind in kinds}
+    probes = probe_names(len(robot.chains))[3 * number : 3 * number + 3]
+    names |= dict(zip(probe_names(1), probes, strict=True))
+    return ChainOf(arm, base, number, tuple(moving), tuple(joints[:start]), names, robot.columns)
+
+
+def chains_of(robot: Arm) -> dict[str, ChainOf]:
+    """All chains of a robot by name."""
+    return {name: chain_of(robot, name) for name, _ in robot.chains}
+
+
+def _rows_of(arm: Arm) -> Float[np.ndarray, "n 5"]:
+    beta = np.zeros(arm.joints) if arm.beta is None else arm.beta
+    return np.array([np.asarray(x) for x in (arm.theta, arm.d, arm.a, arm.alpha, beta)]).T
+
+
+def base_pose(robot: Arm, name: str) -> Transform:
+    """The base of a chain in the base of the robot, mm."""
+    return chain_of(robot, name).base
+
+
+def together(
+    arms: Mapping[str, Arm],
+    *,
+    joints: Mapping[str, Sequence[str]] | None = None,
+    bases: Mapping[str, Numbers] | None = None,
+    mimic: Mapping[str, tuple[str, float, float]] | None = None,
+) -> Arm:
+    """A robot of several arms: one arm with the joints of all, each arm one of its chains.
+
+    Joints of the same name, which chains begin with, are the same joint, whose parameters are tied. The first arm's
+    base is that of the robot; arms whose first joint is another one stand on a base of their own, with six parameters.
+    `InputError` where tied parameters have different values, chains that have separated have a joint in common again,
+    or an arm is not a plain one.
+
+    Args:
+        arms: Arms by the name of their chain.
+        joints: Names of the joints of each chain; by default chains have none in common.
+        bases: Base of each arm, but for the first one, in that of the first: a transform ``(4, 4)`` or a position, mm.
+        mimic: By name of a joint the name of the joint that it follows, the factor, and the offset in rad, or mm.
+
+    Example:
+        >>> arms = {"left": aj.load_arm("panda"), "right": aj.load_arm("panda")}
+        >>> robot = aj.kinematics.together(arms, bases={"right": (0.0, -800.0, 0.0)})
+        >>> print(robot.joints, robot.fixed, len(aj.Parameters.free_of(robot).names))
+        17 (8, 9, 10) 56
+    """
+    arms = {str(name): to_numpy(arm) for name, arm in arms.items()}
+    for name, arm in arms.items():
+        if arm.chains or arm.fixed or arm.mimic or arm.corrections is not None or arm.alpha.ndim > 1:
+            raise InputError(f"arm '{name}' must be one plain arm without corrections; give its parameters alone.")
+    of_chain = {name: [f"{name}\0{i}" for i in range(arm.joints)] for name, arm in arms.items()}
+    for name, given in (joints or {}).items():
+        if name not in arms:
+            raise InputError(f"joints of '{name}' are given, but there is no such arm{nearest(name, list(arms))}")
+        of_chain[name] = list(given)
+        if len(set(given)) != len(of_chain[name]) or len(of_chain[name]) != arms[name].joints:
+            raise InputError(f"joints of '{name}' must be {arms[name].joints} different names, one per joint.")
+    after: dict[str, set[str]] = {}  # what comes next in some chain
+    before: dict[str, str] = {}
+    for name, chain in of_chain.items():
+        for last, joint in zip(["", *chain], [*chain, f"\0{name}"], strict=True):
+            after.setdefault(last, set()).add(joint)
+            if before.setdefault(joint, last) != last:
+                raise InputError(
+                    f"joint '{joint}' comes after different joints in two chains; chains that have separated cannot "
+                    "meet again."
+                )
+    first = next(iter(of_chain.values()))[0]
+    place: dict[str, int] = {}  # number of each joint, from 1; of links that are fixed joints, by "before > after"
+    rows: list[np.ndarray] = []
+    limits: list[tuple[float, float]] = []
+    fixed: list[int] = []
+    chains: dict[str, list[int]] = {}
+
+    def number_of(key: str, row: Iterable[float], what: str, limit: Iterable[float] = (0.0, 0.0)) -> int:
+        values = np.array([*row], dtype=float)
+        if key not in place:
+            place[key] = len(rows) + 1
+            rows.append(values)
+            limits.append((*limit,))
+        elif (wrong := np.flatnonzero(np.abs(rows[place[key] - 1] - values) > _SAME)).size:
+            kind = _ROW[wrong[0]]
+            raise InputError(
+                f"joint '{what}' has different values of {kind} in two chains, {rows[place[key] - 1][wrong[0]]:.9g} "
+                f"and {values[wrong[0]]:.9g}; tied parameters must have the same value."
+            )
+        return place[key]
+
+    prismatic: set[int] = set()
+    for name, chain in of_chain.items():
+        arm, numbers = arms[name], []
+        if chain[0] != first:
+            base = as_transform((bases or {}).get(name, np.zeros(3)), f"the base of '{name}'")
+            for i, row in enumerate(mount_rows(base)):
+                numbers.append(number_of(f"{chain[0]} < {i}", row, chain[0]))
+                fixed.append(numbers[-1])
+        reach = (
+            joint_limits(arm, None) if arm.prismatic or arm.limits is not None else [(-math.pi, math.pi)] * arm.joints
+        )
+        for i, (joint, row) in enumerate(zip(chain, _rows_of(arm), strict=True)):
+            branches = len(after[joint]) > 1
+            numbers.append(number_of(joint, np.zeros(5) if branches else row, joint, reach[i]))
+            if i + 1 in arm.prismatic:
+                prismatic.add(numbers[-1])
+            if branches:
+                following = chain[i + 1] if i + 1 < len(chain) else f"\0{name}"
+                numbers.append(number_of(f"{joint} > {following}", row, joint))
+                fixed.append(numbers[-1])
+        chains[name] = numbers
+    for joint, (source, *_) in (mimic or {}).items():
+        for other in (joint, source):
+            if other not in place:
+                raise InputError(
+                    f"'{joint}' mimics '{source}', but the robot has no joint '{other}'; correct the name."
+                )
+    values = dict(zip(_ROW, np.array(rows).T, strict=True))
+    if not np.any(values["beta"]) and all(arm.beta is None for arm in arms.values()) and not any(map(_is_mount, place)):
+        del values["beta"]
+    return Arm(
+        **values,
+        probe=np.concatenate([np.asarray(arm.probe) for arm in arms.values()]),
+        limits=limits,
+        prismatic=prismatic,
+        fixed=fixed,
+        mimic=[(place[joint], place[source], *rest) for joint, (source, *rest) in (mimic or {}).items()],
+        chains=chains,
+    )
+
+
+def _is_mount(key: str) -> bool:
+    return " < " in key
+
+
+def as_transform(value: Numbers, what: str) -> Transform:
+    """A transform ``(4, 4)``, or one of a position; `InputError` where it is neither."""
+    array = np.asarray(as_floats(value, what))
+    transform = np.eye(4)
+    if array.shape == (3,):
+        transform[:3, 3] = array
+        return transform
+    turn = array[:3, :3] if array.shape == (4, 4) else np.zeros((3, 3))
+    if not (np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) and np.linalg.det(turn) > 0):
+        raise InputError(f"{what} must be a position (3) or a rigid transform (4, 4), mm.")
+    return array
+
+
+def mount_rows(base: Transform) -> list[tuple[float, ...]]:
+    """theta, d, a, alpha and beta of the three fixed joints that carry a base."""
+    turn = (rotation(2, -math.pi / 2) @ base)[:3, :3]  # Rx(alpha) Ry(beta) Rz(theta)
+    level = math.hypot(turn[0, 0], turn[0, 1])
+    beta = math.atan2(turn[0, 2], level)
+    if level > 1e-9:
+        alpha, theta = math.atan2(-turn[1, 2], turn[2, 2]), math.atan2(-turn[0, 1], turn[0, 0])
+    else:  # the axis along y, where alpha and theta turn about the same line
+        alpha, theta = 0.0, math.atan2(turn[1, 0], turn[1, 1])
+    x, y, z = base[:3, 3]
+    return [(0.0, z, x, 0.0, 0.0), (math.pi / 2, 0.0, y, alpha, beta), (theta, 0.0, 0.0, 0.0, 0.0)]
+
+
+def mount_names(chain: ChainOf) -> list[str]:
+    """The six parameters of the robot that say where the base of a chain is; none of the robot's own base."""
+    free = zip(chain.mount, _MOUNT, strict=True) if chain.mount else ()
+    return [f"{kind}_{joint}" for joint, kinds in free for kind in kinds]
+
+
+def with_bases(robot: Arm, bases: Mapping[str, Transform]) -> Arm:
+    """The robot with the bases of some chains elsewhere, in the base of the robot."""
+    for name, base in bases.items():
+        chain = chain_of(robot, name)
+        if not chain.mount:
+            raise InputError(f"chain '{name}' stands on the base of the robot, which does not move.")
+        rows = zip(chain.mount, mount_rows(base), strict=True)
+        robot = robot.replace(
+            **{f"{kind}_{joint}": x for joint, row in rows for kind, x in zip(_ROW, row, strict=True)}
+        )
+    return robot
+
+
+def with_chain(robot: Arm, name: str, arm: Arm) -> Arm:
+    """The robot with the parameters of a chain from the arm that `chain_of` gave, changed."""
+    chain = chain_of(robot, name)
+    pairs = [(chain.names[own], value_of(arm, own), value_of(chain.arm, own)) for own in chain.names]
+    return robot.replace(**{name: value_of(robot, name) + new - old for name, new, old in pairs if new != old})
+
+
+def default_names(robot: Arm) -> tuple[str, ...]:
+    """The free parameters of a robot where nothing is said: those of each chain that `plain_held` leaves, once, with
+    one base for the whole robot, and those of the bases of other chains."""
+    held: set[str] = set()
+    free: set[str] = set()
+    seen: set[int] = set()
+    for chain in chains_of(robot).values():
+        arm = chain.arm
+        gauges = [i for i in arm.prismatic if chain.joints[i - 1] not in seen]
+        fixed = plain_held(arm, base=chain.number == 0 or bool(chain.mount), slides=gauges)
+        own = [parameter for parameter in parameter_names(arm) if not parameter.startswith("beta_")]
+        held |= {chain.names[parameter] for parameter in own if parameter in fixed}
+        free |= {chain.names[parameter] for parameter in own} | set(mount_names(chain))
+        seen |= set(chain.joints)
+    return tuple(name for name in parameter_names(robot) if name in free - held)
+
+
+def plain_held(arm: Arm, *, base: bool = True, slides: Iterable[int] | None = None) -> set[str]:
+    """The parameters that `Parameters.free_of` holds: of the ``base``, of prismatic joints, and of the last link."""
+    n, prismatic = arm.joints, arm.prismatic if slides is None else tuple(slides)
+    held = {f"a_{n}", f"alpha_{n}", "probe_x", "probe_y"} | ({"theta_1", "d_1"} if base else set())
+    held |= {f"a_{i}" for i in prismatic} | {f"d_{i + 1}" for i in prismatic if i < n}
+    return held | ({f"theta_{n}", "probe_z"} if n in prismatic else set())
