@@ -195,8 +195,8 @@ def picture_charts(image: Image) -> list[Chart]:
     for i in (kept[place] for place in thinned(len(kept), _PICTURES)):
         own = image.owner == i
         arrows = _arrows(image, "", starts[own], factor * image.residuals[own], "bright")
-        words = [f"corner {number}" for number in image.ids[own]]
-        marks = Marks("", *starts[own].T, "dot", "bright", words, size=4), arrows
+        (x, y), words = starts[own].T, [f"corner {number}" for number in image.ids[own]]
+        marks = Marks("", x, y, "dot", "bright", words, size=4), arrows
         plots.append(_picture(image, image.pictures[i], f"{image.names[i]}: {rms[i]:.3g} px RMS", marks))
     description = (
         f"{len(plots)} of {count} images, from the largest residuals to the smallest. Arrows lead from where the "
