@@ -22,7 +22,8 @@ from .capture import Capture
 from .capture_data import ReferenceLength, check_temperatures
 from .noise import Noise
 from .observations.declared import MOST_POSES
-from .observations.observation import AbstractObservation, AbstractSimulated
+from .observations.observation import AbstractObservation
+from .observations.simulated import AbstractSimulated
 
 _RESOLUTION = Annotated[Float[AnyArray, ""] | Float[AnyArray, " 2"], Range(least=0)]
 

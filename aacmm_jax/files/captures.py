@@ -13,7 +13,8 @@ from ..data.capture import Capture, ReferenceLength, check_one_capture, check_re
 from ..data.capture_data import UNKNOWN, Repeated
 from ..data.noise import ArmNoise
 from ..data.observations.declared import Entry
-from ..data.observations.observation import AbstractObservation, kinds
+from ..data.observations.observation import AbstractObservation
+from ..data.observations.simulated import kinds
 from ..data.recording import ProbedSphere, ReadImage, Recording, checked_sphere
 from ..kinematics.arm import Arm, correction_names, reading_as, readings_unit
 from ..kinematics.beside import BY_JOINT, COLUMNS

@@ -23,8 +23,9 @@ from ..core.errors import InputError
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import ReferenceLength
 from ..data.observations.held import Socket
-from ..data.observations.observation import AbstractObservation, kinds
+from ..data.observations.observation import AbstractObservation
 from ..data.observations.pixels import Pixels
+from ..data.observations.simulated import kinds
 from ..data.recording import SphereTest
 from ..kinematics.arm import Arm, by_joint
 from ..kinematics.correction_kinds import REFERENCE_TEMPERATURE
