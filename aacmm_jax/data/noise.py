@@ -74,7 +74,7 @@ class Noise(eqx.Module):
         return each * kinds.read if kinds.followers else each
 
     def of_columns(self, kinds: JointKinds | None, joints: int, columns: int) -> Float[np.ndarray, " columns"]:
-        """Standard deviations of all columns of readings, rad and mm; 0 for torques and temperatures."""
+        """Standard deviations of all columns of readings, rad and mm; 0 for what is recorded beside them."""
         of_joints = np.broadcast_to(np.asarray(self.of_readings(kinds)), (joints,))
         return np.concatenate([of_joints, np.zeros(columns - joints)])
 

@@ -15,6 +15,7 @@ from ..core.arguments import NOT_EMPTY, Range, checked, items_of, shown
 from ..core.arrays import Numbers, as_array, as_floats
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, in_chunks, namespace, numpy_if_known, to_jax, to_numpy
+from .beside import COLUMNS, Beside, extras
 from .chain import Corrections, Geometry, JointKinds, tip_pose
 from .jacobian import Indices, tip_jacobian, tip_position
 from .joint_checks import Limits, checked_chains, checked_limits, checked_mimic
@@ -60,6 +61,10 @@ class Arm(eqx.Module):
             those of the joints is then the number of the chain that a pose is of, from 0; joints of other chains do not
             matter for it. ``probe`` has the tips of all chains in turn, ``(..., 3 c)``: ``probe_x`` of the first chain,
             ``probe2_x`` of the second.
+        directions: Whether n more columns follow: 1 where the joint reached the pose with rising readings, -1 with
+            falling ones, 0 where it is unknown; for backlash.
+        load: Whether one more column follows: the mass at the tip, kg, besides that of the arm and its tool; 0 where it
+            is missing.
         thermometer: Whether readings have one more, last column: the temperature of the arm, C, of which only thermal
             expansion makes use. Where it is missing, the arm is taken to be at 20 C.
 
@@ -82,8 +87,7 @@ class Arm(eqx.Module):
     coefficients: Float[AnyArray, "... k"] | None
     gravity: Float[AnyArray, "... 3"] | None
     corrections: Corrections | None
-    torques: bool = eqx.field(static=True)
-    thermometer: bool = eqx.field(static=True)
+    recorded: tuple[str, ...] = eqx.field(static=True)  # which of `beside.COLUMNS` readings are stated to have
     fixed: tuple[int, ...] = eqx.field(static=True)
     mimic: tuple[tuple[int, int, float, float], ...] = eqx.field(static=True)
     chains: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)
@@ -103,6 +107,8 @@ class Arm(eqx.Module):
         gravity: Numbers | None = None,
         corrections: Corrections | None = None,
         torques: bool = False,
+        directions: bool = False,
+        load: bool = False,
         thermometer: bool = False,
         fixed: Iterable[int] = (),
         mimic: Iterable[tuple[int, int, float, float]] = (),
@@ -141,10 +147,10 @@ class Arm(eqx.Module):
         self.fixed = tuple(sorted(set(checked(fixed, Sequence[Annotated[int, Range(1, self.joints)]], "fixed"))))
         self.mimic = checked_mimic(mimic, self.joints, self.fixed)
         self.limits = None if limits is None else checked_limits(limits, self.joints, self.prismatic, self.fixed)
-        self.torques = bool(torques) or (corrections is not None and corrections.functions.by_torque)
-        if self.torques and self.joints == 1:
+        given = dict(zip(COLUMNS, (torques, directions, load, thermometer), strict=True))
+        self.recorded = tuple(name for name in COLUMNS if given[name])
+        if "torques" in self.beside.possible and self.joints == 1:
             raise InputError("torques need an arm with at least two joints; create the arm without torques.")
-        self.thermometer = bool(thermometer) or (corrections is not None and corrections.functions.expands)
 
     @property
     def joints(self) -> int:
@@ -152,16 +158,21 @@ class Arm(eqx.Module):
         return self.alpha.shape[-1]
 
     @property
+    def beside(self) -> Beside:
+        """Which columns readings may have after those of the joints: those stated, and those that corrections read."""
+        read = () if self.corrections is None else self.corrections.functions.columns
+        possible = tuple(name for name in COLUMNS if name in read or name in self.recorded) if read else self.recorded
+        return Beside(self.joints, self.recorded, possible, len(self.chains))
+
+    @property
     def columns(self) -> int:
-        """Number of columns of readings: the joints, their torques and the thermometer where there are such."""
-        return self.joints * (1 + self.torques) + self.thermometer + bool(self.chains)
+        """Number of columns of readings, with everything that may be recorded beside the joints."""
+        return self.beside.width(self.beside.possible)
 
     @property
     def possible_columns(self) -> tuple[int, ...]:
-        """Numbers of columns that readings may have: torques and temperatures may be missing."""
-        beside = {0, self.joints * self.torques}
-        last = {int(bool(self.chains)) + warmth for warmth in {0, int(self.thermometer)}}
-        return tuple(sorted({self.joints + more + count for more in beside for count in last}))
+        """Numbers of columns that readings may have: what is recorded beside the joints may be missing."""
+        return self.beside.widths
 
     @property
     def geometry(self) -> Geometry:
@@ -175,7 +186,11 @@ class Arm(eqx.Module):
             slides = tuple(i in prismatic for i in range(1, self.joints + 1))
             kinds = JointKinds(slides, (*following, *still), chains)
         corrected = (self.coefficients, self.gravity, self.corrections)
-        return Geometry(self.alpha, self.a, self.d, self.theta, self.beta, self.probe, kinds, *corrected)
+        beside = self.beside
+        return Geometry(
+            *(self.alpha, self.a, self.d, self.theta, self.beta, self.probe, kinds, *corrected),
+            beside=beside if beside.possible or beside.chains else None,
+        )
 
     def position(self, q: Numbers) -> Float[AnyArray, "... 3"]:
         """Tip in the base frame, mm, at readings q, rad, or mm of prismatic joints: ``(..., n) -> (..., 3)``."""
@@ -204,8 +219,9 @@ class Arm(eqx.Module):
         By parameter name (``d_3=750.0``), or a whole argument of the constructor (``probe=(0, 0, 131)``); mm and rad. A
         single parameter is set after whole arguments.
         """
-        whole = [field.name for field in dataclasses.fields(self)]
+        whole = [field.name for field in dataclasses.fields(self) if field.name != "recorded"]
         arguments: dict[str, Any] = {name: changes.pop(name, getattr(self, name)) for name in whole}
+        arguments |= {name: changes.pop(name, name in self.recorded) for name in COLUMNS}
         for name, value in changes.items():
             kind, i = locate(self, name)
             array = np.zeros(self.alpha.shape) if arguments[kind] is None else as_floats(arguments[kind], kind)
@@ -230,10 +246,9 @@ def checked_readings(arm: Arm, q: Numbers, like: AnyArray | None = None) -> Floa
     """Readings as an array like the arm's or another, or `InputError` where they do not have the arm's columns."""
     array, joints = as_array(q, "q", like=arm.alpha if like is None else like), arm.joints
     if array.ndim == 0 or array.shape[-1] not in arm.possible_columns:
-        other = ", their torques" * arm.torques + ", and a thermometer" * arm.thermometer
         raise InputError(
-            f"q has shape {array.shape}, but the arm has {joints} joints{other}; the last axis must run over the "
-            "joints."
+            f"q has shape {array.shape}, but the arm has {joints} joints{extras(arm.beside.possible)}; the last axis "
+            "must run over the joints."
         )
     return array
 
@@ -248,15 +263,15 @@ def check_columns(arm: Arm, columns: int) -> None:
     """Raise `InputError` where readings of a capture have not the columns of an arm; without temperatures it was at
     20 C."""
     if columns not in arm.possible_columns:
-        temperature = ", and the temperature in the last column" if arm.thermometer else ""
+        other = extras(arm.beside.possible)
         if columns == arm.joints + 1:
-            temperature = ", or use an arm with thermometer=True if the last column is the temperature"
-        elif columns >= 2 * arm.joints and not arm.torques:
-            temperature = ", or use an arm with torques=True if columns of torques follow"
+            other = ", or use an arm with thermometer=True if the last column is the temperature"
+        elif columns >= 2 * arm.joints and "torques" not in arm.beside.possible:
+            other = ", or use an arm with torques=True if columns of torques follow"
         raise InputError(
-            f"the capture has {columns} columns, but the arm has {arm.joints} joints; give one column per "
-            f"joint{temperature}."
+            f"the capture has {columns} columns, but the arm has {arm.joints} joints; give one column per joint{other}."
         )
+    arm.beside.names(columns)
 
 
 def joint_limits(arm: Arm, limits: Limits | None) -> JointLimits:
@@ -283,8 +298,9 @@ def arm_of(geometry: Geometry, limits: Limits | None = None) -> Arm:
             "mimic": [(i + 1, source + 1, *rest) for i, source, *rest in kinds.followers if i != source],
             "chains": [(str(c), [i + 1 for i in joints]) for c, joints in enumerate(kinds.chains, start=1)],
         }
-    arrays = {name: value for name, value in geometry._asdict().items() if name != "kinds"}
-    return Arm(**arrays, limits=limits, **facts)
+    arrays = {name: value for name, value in geometry._asdict().items() if name not in ("kinds", "beside")}
+    arm = Arm(**arrays, limits=limits, **facts)
+    return arm if geometry.beside is None else reading_as(arm, geometry.beside.recorded)
 
 
 def by_joint(arm: Arm, angular: Any, linear: Any) -> list[Any]:
@@ -298,14 +314,20 @@ def readings_unit(arm: Arm) -> str:
     return "rad, mm of prismatic joints" if arm.prismatic else "rad"
 
 
+def reading_as(arm: Arm, recorded: Iterable[str]) -> Arm:
+    """The same arm, whose readings have exactly these of `beside.COLUMNS`, and what its corrections read."""
+    recorded = tuple(recorded)
+    return arm.replace(**{name: name in recorded for name in COLUMNS})
+
+
 def is_single(arm: Arm) -> bool:
     """Whether this is one arm and not a batch."""
     return all(array.ndim == 1 for array in jax.tree.leaves(arm.geometry))
 
 
 def without_corrections(arm: Arm) -> Arm:
-    """The arm whose joints do what they read."""
-    return arm.replace(coefficients=None, gravity=None, corrections=None)
+    """The arm whose joints do what they read; its readings may have the columns that its corrections read."""
+    return reading_as(arm.replace(coefficients=None, gravity=None, corrections=None), arm.beside.possible)
 
 
 def parameter_names(arm: Arm) -> tuple[str, ...]:
