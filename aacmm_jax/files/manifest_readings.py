@@ -87,9 +87,9 @@ class Readings:
         if self._first is None:
             self._first, self.beside, self.columns = text.path, tuple(recorded), [i + 1 for i in picked]
             self.header, self.angles = list(text.header), angles
-        for name in set(self.beside) ^ set(recorded):
+        for name in (name for name in COLUMNS if (name in self.beside) != (name in recorded)):
             without, other = (text.path, self._first) if name in self.beside else (self._first, text.path)
-            what, add = f"{name}", f"add columns {BESIDE[name].format(1)}, ... to {without}."
+            what, add = name, f"add columns {BESIDE[name].format(1)}, ... to {without}."
             if name not in BY_JOINT:
                 what = "temperatures" if name == "thermometer" else name
                 add = f"add a column {BESIDE[name]} to {without}, or state {BESIDE[name]} in its table."
