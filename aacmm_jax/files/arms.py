@@ -2,6 +2,7 @@
 
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from .arm_tables import GEOMETRY, ArmFile, Identification, NoiseTable
 from .controllers import read_ur_kinematics
 from .outputs import as_path, storable, write_text
 from .toml import read_toml
-from .urdf import read_urdf
+from .urdf_robots import read_urdf
 
 _SHIPPED = Path(__file__).with_name("shipped_arms")
 _ROBOTS = (".urdf", ".xacro")  # the latter for the message that says how to expand it
@@ -43,7 +44,11 @@ def shipped_arms() -> tuple[str, ...]:
 
 
 def load_arm(
-    source: str | os.PathLike, *, base: str | None = None, tip: str | None = None, probe: Numbers | None = None
+    source: str | os.PathLike,
+    *,
+    base: str | None = None,
+    tip: str | Sequence[str] | None = None,
+    probe: Numbers | None = None,
 ) -> Arm:
     """The arm of a file.
 
@@ -58,7 +63,8 @@ def load_arm(
         source: Name of a shipped arm (``"cheng2018-simulation"``), or path of a TOML file, a URDF, or a Universal
             Robots ``kinematics.yaml``.
         base: Of a URDF: the link that does not move; by default its root.
-        tip: Of a URDF: the link at the end; by default the only one that has no link after it.
+        tip: Of a URDF: the link at the end, or those at the ends of a robot's chains, which are named after them; by
+            default the links that have no link after them, one for each chain of joints.
         probe: A tool's tip ``(3,)`` in the frame of the last link, mm; by default that frame's origin. Not of an arm
             file that states one.
 
@@ -74,7 +80,7 @@ def load_specification(
     source: str | os.PathLike,
     *,
     base: str | None = None,
-    tip: str | None = None,
+    tip: str | Sequence[str] | None = None,
     probe: Numbers | None = None,
     capture: Capture | None = None,
 ) -> ArmSpecification:
@@ -99,7 +105,9 @@ def load_specification(
     return for_capture(specification, proposed, capture)
 
 
-def load_noise(source: str | os.PathLike, *, base: str | None = None, tip: str | None = None) -> ArmNoise:
+def load_noise(
+    source: str | os.PathLike, *, base: str | None = None, tip: str | Sequence[str] | None = None
+) -> ArmNoise:
     """The noise that is usual for the arm of a file: that of its ``[noise]`` table, else that of its class.
 
     A file without the table is that of a measuring arm, or of a robot where it is a URDF, names one, or is a
@@ -121,7 +129,9 @@ def load_noise(source: str | os.PathLike, *, base: str | None = None, tip: str |
         return table.noise(arm, default)
 
 
-def usual_noise(source: str | os.PathLike, *, base: str | None = None, tip: str | None = None) -> ArmNoise | None:
+def usual_noise(
+    source: str | os.PathLike, *, base: str | None = None, tip: str | Sequence[str] | None = None
+) -> ArmNoise | None:
     """The noise of the ``[noise]`` table of an arm's file, as `load_noise` has it; None where it has none.
 
     ``source`` is, like all arguments that are not named here, that of `load_arm`.
@@ -159,7 +169,11 @@ def arm_beside(folder: Path, arm: str) -> str | Path:
 
 
 def read_arm(
-    source: str | os.PathLike, *, base: str | None = None, tip: str | None = None, probe: Numbers | None = None
+    source: str | os.PathLike,
+    *,
+    base: str | None = None,
+    tip: str | Sequence[str] | None = None,
+    probe: Numbers | None = None,
 ) -> tuple[ArmSpecification, bool]:
     """The arm of a file as `load_specification` takes it, and whether the file proposes an identification."""
     path = _path_of(source)

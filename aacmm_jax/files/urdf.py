@@ -2,17 +2,15 @@
 
 import math
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator, Sequence
 from functools import reduce
-from pathlib import Path
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from jaxtyping import Float
 
-from ..core.arrays import Numbers
-from ..core.errors import InputError, naming
+from ..core.errors import InputError
 from ..core.rotations import roll_pitch_yaw
 from ..core.text import quoted, shorten
 from ..kinematics.arm import Arm, arm_of
@@ -28,8 +26,7 @@ from ..kinematics.axes_to_dh import (
     tip_frame,
 )
 from ..kinematics.chain import JointKinds
-from ..kinematics.parameters import ArmSpecification, UrdfSource, single, with_tool
-from .inputs import InputFile
+from ..kinematics.parameters import ArmSpecification, UrdfSource, single
 from .outputs import write_text
 from .urdf_text import Robot, UrdfJoint, edited, parse_urdf
 
@@ -96,28 +93,13 @@ class ExportedUrdf(NamedTuple):
     notes: tuple[str, ...]  # what was added, in sentences
 
 
-def read_urdf(
-    path: str | os.PathLike, *, base: str | None = None, tip: str | None = None, probe: Numbers | None = None
-) -> ArmSpecification:
-    """The arm of a serial chain of a URDF, in the first D-H frame, with the text of the file; arguments as of
-    `load_arm`."""
-    file = InputFile(path)
-    with naming(path):
-        try:
-            text = file.content.decode("utf-8")
-        except UnicodeDecodeError as error:
-            raise InputError("the file is not UTF-8 text; save it as UTF-8.") from error
-        robot = parse_urdf(text)
-        source = UrdfSource(text, *_ends(robot, base, tip))
-        arm = urdf_chain(source).arm
-        return ArmSpecification(arm if probe is None else with_tool(arm, probe), Path(file).stem, urdf=source)
-
-
-def urdf_chain(source: UrdfSource) -> UrdfChain:
+def urdf_chain(source: UrdfSource, *, alone: bool = True) -> UrdfChain:
     """The chain between two links of a URDF as an arm; exact, whatever the directions of the axes.
 
     Args:
         source: The text of the file and the names of the links.
+        alone: Whether joints that mimic another one follow it, which must be in the chain; a part of a robot has them
+            as joints with a reading.
 
     Example:
         >>> chain = aj.files.urdf_chain(aj.files.load_specification("robot.urdf").urdf)
@@ -127,12 +109,12 @@ def urdf_chain(source: UrdfSource) -> UrdfChain:
         [750.   0. 300.] mm
     """
     robot = parse_urdf(source.text)
-    path = _joints_between(robot, source.base, source.tip)
+    path = joints_between(robot, source.base, source.tip)
     joints, before, frames, frame, fixed = [], [], [], np.eye(4), np.eye(4)
     for joint in path:
         fixed_before, fixed = fixed, fixed @ joint.origin
         if joint.kind != "fixed":
-            _check_moving(joint)
+            _check_moving(joint, [other.name for other in path] if alone else robot.joints)
             frame, fixed = frame @ fixed_before @ joint.origin, np.eye(4)
             joints.append(joint)
             before.append(fixed_before)
@@ -156,6 +138,9 @@ def urdf_chain(source: UrdfSource) -> UrdfChain:
     limits = [_REVOLUTION if joint.kind == "continuous" else joint.limits or _REVOLUTION for joint in joints]
     prismatic = tuple(joint.kind == "prismatic" for joint in joints)
     arm = arm_of(geometry._replace(kinds=JointKinds(prismatic) if any(prismatic) else None), limits)
+    place = {joint.name: number for number, joint in enumerate(joints, start=1)}
+    if alone and (mimic := {joint.name: mimic_of(joint, robot) for joint in joints if joint.mimics is not None}):
+        arm = arm.replace(mimic=[(place[name], place[source], *rest) for name, (source, *rest) in mimic.items()])
     return UrdfChain(arm, base, robot, tuple(joints), tuple(before), tip_before, tip_joint)
 
 
@@ -281,8 +266,18 @@ def _attributes(transform: Transform) -> dict[str, str]:
     return {key: " ".join(repr(float(value) + 0.0) for value in three) for key, three in values.items()}
 
 
-def _check_moving(joint: UrdfJoint) -> None:
-    """Refuse a joint that an arm does not have."""
+def mimic_of(joint: UrdfJoint, robot: Robot) -> tuple[str, float, float]:
+    """The joint that a joint mimics, the factor and the offset, by readings in rad and mm."""
+    element = joint.element.child("mimic")
+    assert element is not None
+    assert joint.mimics is not None
+    factor, offset = (float(element.numbers(*of)[0]) for of in (("multiplier", (1.0,)), ("offset", (0.0,))))
+    unit, followed = (1000.0 if kind == "prismatic" else 1.0 for kind in (joint.kind, robot.joints[joint.mimics].kind))
+    return joint.mimics, factor * unit / followed, offset * unit
+
+
+def _check_moving(joint: UrdfJoint, others: Container[str]) -> None:
+    """Refuse a joint that an arm does not have; ``others`` are the joints that it may mimic."""
     what, slides = f"joint {quoted(joint.name)}", joint.kind == "prismatic"
     if joint.kind not in ("revolute", "continuous", "prismatic"):
         of_format = joint.kind in ("floating", "planar")
@@ -290,10 +285,10 @@ def _check_moving(joint: UrdfJoint) -> None:
         raise InputError(
             f"{what} {kind}, which cannot be part of an arm; choose links without this joint between them."
         )
-    if joint.mimics is not None:
+    if joint.mimics is not None and joint.mimics not in others:
         raise InputError(
-            f"{what} mimics {quoted(joint.mimics)}, so it has no reading of its own; choose links without this joint "
-            "between them."
+            f"{what} mimics {quoted(joint.mimics)}, which is not a joint of the same chain; choose links without "
+            "this joint between them."
         )
     if joint.axis is None:
         raise InputError(f"{what} has an axis of length 0; correct <axis xyz=...> of the joint.")
@@ -327,7 +322,7 @@ def _joints_before(robot: Robot, link: str) -> list[UrdfJoint]:
     return joints
 
 
-def _joints_between(robot: Robot, base: str, tip: str) -> list[UrdfJoint]:
+def joints_between(robot: Robot, base: str, tip: str) -> list[UrdfJoint]:
     """The joints from base to tip."""
     back = _joints_before(robot, tip)
     parents = [joint.parent for joint in back]
@@ -351,14 +346,14 @@ def _joints_between(robot: Robot, base: str, tip: str) -> list[UrdfJoint]:
     )
 
 
-def _ends(robot: Robot, base: str | None, tip: str | None) -> tuple[str, str]:
-    """The base and the tip link that are named, else the root, and the only end of a chain that moves."""
-    for what, link in (("base", base), ("tip", tip)):
+def ends_of(robot: Robot, base: str | None, given: Sequence[str]) -> tuple[str, list[str]]:
+    """The base and the tip links that are named, else the root, and the ends of chains that move."""
+    for what, link in (("base", base), *(("tip", tip) for tip in given)):
         if link is not None and link not in robot.links:
             raise InputError(
-                f"the URDF has no link {quoted(link)} for the {what}; its links are {_listed(robot.links)}."
+                f"the URDF has no link {quoted(link)} for the {what}; its links are {listed_links(robot.links)}."
             )
-    if base is None and tip is not None and (back := _joints_before(robot, tip)):
+    if base is None and given and (back := _joints_before(robot, given[0])):
         base = back[-1].parent
     if base is None:
         roots = [link for link in robot.links if link not in robot.joint_before]
@@ -371,11 +366,11 @@ def _ends(robot: Robot, base: str | None, tip: str | None) -> tuple[str, str]:
             )
         if len(roots) > 1:
             raise InputError(
-                f"the URDF has {len(roots)} root links, {_listed(roots)}; choose the base (base= or --base)."
+                f"the URDF has {len(roots)} root links, {listed_links(roots)}; choose the base (base= or --base)."
             )
         base = roots[0]
-    if tip is not None:
-        return base, tip
+    if given:
+        return base, [*given]
     tips, inner = [], {joint.parent for joint in robot.joints.values()}
     for link in (link for link in robot.links if link not in inner):
         back = _joints_before(robot, link)
@@ -384,10 +379,9 @@ def _ends(robot: Robot, base: str | None, tip: str | None) -> tuple[str, str]:
             tips.append(link)
     if not tips:
         raise InputError(f"there is no moving joint after {quoted(base)}; choose another base (base= or --base).")
-    if len(tips) > 1:
-        raise InputError(f"the URDF has several chains, which end at {_listed(tips)}; choose the tip (tip= or --tip).")
-    return base, tips[0]
+    return base, tips
 
 
-def _listed(links: Iterable[str]) -> str:
+def listed_links(links: Iterable[str]) -> str:
+    """Names of links as a message lists them."""
     return shorten([quoted(link) for link in links], _LISTED)

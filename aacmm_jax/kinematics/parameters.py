@@ -301,7 +301,12 @@ class UrdfSource(NamedTuple):
 
     text: str  # the whole file
     base: str  # name of the link that does not move
-    tip: str  # name of the link at the end of the chain
+    tip: str  # name of the link at the end of the chain; of a robot those of all chains, one a line
+
+    @property
+    def tips(self) -> tuple[str, ...]:
+        """Names of the links at the ends of the chains."""
+        return tuple(self.tip.split("\n"))
 
 
 class ArmSpecification(NamedTuple):
@@ -342,6 +347,6 @@ def single(arm: Arm) -> Arm:
 
 
 def with_tool(arm: Arm, tool: Numbers) -> Arm:
-    """The same arm with a tool at its tip, in the frame of the last joint, mm."""
+    """The same arm with a tool at its tip, or at all tips of a robot, in the frame of the last joint, mm."""
     checked = Arm(alpha=[0.0], a=[0.0], d=[0.0], probe=tool).probe
-    return arm.replace(probe=np.asarray(arm.probe) + np.asarray(checked))
+    return arm.replace(probe=np.asarray(arm.probe) + np.resize(checked, np.shape(arm.probe)))

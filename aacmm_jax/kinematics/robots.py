@@ -93,7 +93,7 @@ def chain_of(robot: Arm, name: str) -> ChainOf:
             moving.append(joint)
             owner.append(joint)
     place = {joint: i for i, joint in enumerate(moving, start=1)}
-    limits = None if robot.limits is None else np.array(robot.limits)[np.array(moving) - 1]
+    limits = None if robot.limits is None else [robot.limits[joint - 1] for joint in moving]
     following = [row for row in robot.mimic if row[0] in place]
     for joint, source, *_ in following:
         if source not in place:

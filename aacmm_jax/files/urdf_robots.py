@@ -1,0 +1,81 @@
+"""Robots of several chains in a URDF: the chains from one base to several tips as one arm."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from ..core.arrays import Numbers
+from ..core.errors import InputError, naming
+from ..core.text import quoted
+from ..kinematics.arm import Arm
+from ..kinematics.axes_to_dh import inverse
+from ..kinematics.parameters import ArmSpecification, UrdfSource, with_tool
+from ..kinematics.robots import together
+from .inputs import InputFile
+from .urdf import UrdfChain, ends_of, joints_between, listed_links, mimic_of, urdf_chain
+from .urdf_text import Robot, parse_urdf
+
+
+def read_urdf(
+    path: str | os.PathLike,
+    *,
+    base: str | None = None,
+    tip: str | Sequence[str] | None = None,
+    probe: Numbers | None = None,
+) -> ArmSpecification:
+    """The arm of a serial chain of a URDF, or the robot of several, in the first D-H frame, with the text of the file;
+    arguments as of `load_arm`."""
+    file = InputFile(path)
+    with naming(path):
+        try:
+            text = file.content.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise InputError("the file is not UTF-8 text; save it as UTF-8.") from error
+        robot, given = parse_urdf(text), () if tip is None else (tip,) if isinstance(tip, str) else tuple(tip)
+        base, tips = ends_of(robot, base, given)
+        chosen = tips if given else moving_tips(robot, base, tips)
+        if len(chosen) < min(2, len(tips)):
+            raise InputError(
+                f"the URDF has several links at the end of the same joints, {listed_links(tips)}; choose the tip (tip= "
+                "or --tip)."
+            )
+        source = UrdfSource(text, base, "\n".join(dict.fromkeys(chosen)))
+        arm = urdf_arm(source)
+        return ArmSpecification(arm if probe is None else with_tool(arm, probe), Path(file).stem, urdf=source)
+
+
+def urdf_chains(source: UrdfSource) -> dict[str, UrdfChain]:
+    """The chain to each tip of a robot, by the name of the tip; joints that follow others have a reading here."""
+    tips = {tip: source._replace(tip=tip) for tip in source.tips}
+    return {tip: urdf_chain(one, alone=False) for tip, one in tips.items()}
+
+
+def urdf_arm(source: UrdfSource) -> Arm:
+    """The arm between a base and a tip, or the robot of several tips, whose chains have the names of the tips."""
+    if len(source.tips) == 1:
+        return urdf_chain(source).arm
+    chains = urdf_chains(source)
+    first = next(iter(chains.values()))
+    joints = {tip: [joint.name for joint in chain.joints] for tip, chain in chains.items()}
+    every = {joint.name: joint for chain in chains.values() for joint in chain.joints}
+    mimic = {name: mimic_of(joint, first.robot) for name, joint in every.items() if joint.mimics is not None}
+    for name, (followed, *_) in mimic.items():
+        if followed not in every:
+            raise InputError(
+                f"joint {quoted(name)} mimics {quoted(followed)}, which is in none of the chains; choose tips so that "
+                "both joints are part of the robot, or neither."
+            )
+    arms = {tip: chain.arm for tip, chain in chains.items()}
+    bases = {tip: inverse(first.base) @ chain.base for tip, chain in chains.items()}
+    return together(arms, joints=joints, bases=bases, mimic=mimic)
+
+
+def moving_tips(robot: Robot, base: str, tips: list[str]) -> list[str]:
+    """One tip for each chain of moving joints that is no beginning of another one: the one after most joints."""
+    paths = {tip: joints_between(robot, base, tip) for tip in tips}
+    moving = {tip: tuple(joint.name for joint in path if joint.kind != "fixed") for tip, path in paths.items()}
+    whole = [
+        names for names in dict.fromkeys(moving.values())
+        if not any(other != names and other[: len(names)] == names for other in moving.values())
+    ]  # fmt: skip
+    return [max((tip for tip in tips if moving[tip] == names), key=lambda tip: len(paths[tip])) for names in whole]
