@@ -205,7 +205,8 @@ def _chain_numbers(
     for where, names in (given or {}).items():
         if where not in taken:
             raise InputError(f"chains are given for '{where}', which is not simulated{nearest(where, taken)}")
-        for name in (chosen := items_of(names, "chains")):
+        chosen = (names,) if isinstance(names, str) else tuple(names)
+        for name in chosen:
             if name not in numbers:
                 raise InputError(f"the robot has no chain '{name}'{nearest(str(name), numbers)}")
         taken[where] = np.array([numbers[name] for name in chosen])

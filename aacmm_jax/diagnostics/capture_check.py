@@ -9,6 +9,7 @@ from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.observations.measured import MeasuredPoints
 from ..kinematics.arm import Arm
+from ..kinematics.robots import chains_of
 from .reading_check import EXPLAINED, NEVER, ReadingCheck, checked_fit, reading_fit
 from .reading_fit import ReadingFit
 from .reading_search import Hypothesis
@@ -19,7 +20,11 @@ _LESS = 0.8  # of the residual: what each of several couplings must leave at mos
 
 def check_capture(arm: Arm, capture: Capture) -> ReadingCheck:
     """`check_readings` of what was recorded in sockets, or as one station of an instrument saw it; where no order,
-    signs and zeros explain it, couplings of joints are tried."""
+    signs and zeros explain it, couplings of joints are tried. Of a robot, of the first chain whose readings do not fit,
+    with the chain's own numbers of its joints."""
+    if arm.chains:
+        checks = [check_capture(*part) for part in _by_chain(arm, capture)]
+        return next((check for check in checks if not check.explained), checks[0])
     check = checked_fit(reading_fit(arm, **_evidence_of(arm, capture)))
     return check if check.explained else check._replace(couplings=search_couplings(arm, capture))
 
@@ -28,11 +33,32 @@ def fits_as_recorded(arm: Arm, capture: Capture) -> bool:
     """Whether the readings fit an arm whose parameters differ from nominal ones as those of real arms do, so that no
     other order, signs and zeros have to be searched, which takes seconds. Raises `InputError` as `check_capture`
     does."""
+    if arm.chains:
+        return all(fits_as_recorded(*part) for part in _by_chain(arm, capture))
     fit, n = reading_fit(arm, **_evidence_of(arm, capture)), arm.joints
     as_recorded = Hypothesis(tuple(range(n)), (1,) * n, (0.0,) * n)
     residual, with_zeros = fit.explanation(as_recorded).rms_fitted, fit.with_free_zeros(as_recorded)[1]
     possible = float(np.abs(fit.evidence.q).max()) <= NEVER
     return possible and residual <= EXPLAINED * fit.size and residual <= fit.as_good_as(with_zeros)
+
+
+def _by_chain(robot: Arm, capture: Capture) -> list[tuple[Arm, Capture]]:
+    """Each chain of a robot as an arm, with what it observed."""
+    pairs = []
+    for chain in chains_of(robot).values():
+        sockets, others = {}, []
+        for number, part in enumerate(capture.parts):
+            rows = np.flatnonzero(np.asarray(part.q)[:, robot.joints] == chain.number)
+            if len(rows):
+                chosen = part.select(rows)
+                chosen = chosen.changed(q=chain.of_robot(chosen.q))
+                if number < len(capture.sizes):
+                    sockets[part.name] = chosen.q
+                else:
+                    others.append(chosen)
+        if sockets or others:
+            pairs.append((chain.arm, Capture(sockets, observations=others)))
+    return pairs
 
 
 def _evidence_of(arm: Arm, capture: Capture) -> dict[str, Any]:
@@ -62,8 +88,10 @@ def search_couplings(arm: Arm, capture: Capture) -> dict[str, float]:
     Parallel links, belts and controllers make a joint move with one before it: joint 3 by q_3 - q_2, for instance. As
     for `check_readings`, the arm's parameters and zeros may differ from nominal ones as those of real arms do. Up to
     three couplings are taken one after the other, each the one that explains most. Raises `InputError` as
-    `check_capture` does.
+    `check_capture` does. Chains of a robot are taken to have none.
     """
+    if arm.chains:
+        return {}
     fit, n = reading_fit(arm, **_evidence_of(arm, capture)), arm.joints
     as_recorded = Hypothesis(tuple(range(n)), (1,) * n, (0.0,) * n)
     enough, turning = EXPLAINED * fit.size, [i for i in range(n) if i + 1 not in arm.prismatic]

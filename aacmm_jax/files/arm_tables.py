@@ -162,6 +162,13 @@ class PriorTable(Strict):
         return prior
 
 
+class ChainTable(Strict):
+    """A chain of a robot: its joints, from the base to the tip, from 1."""
+
+    name: str
+    joints: Annotated[list[PositiveInt], Field(min_length=1)]
+
+
 class ArmFile(Strict):
     """An arm file."""
 
@@ -173,9 +180,13 @@ class ArmFile(Strict):
     probe: Point = Field(default_factory=lambda: [0.0, 0.0, 0.0])
     joint: list[JointTable] = Field(default_factory=list)
     prismatic: Annotated[list[PositiveInt], AfterValidator(each_once)] = Field(default_factory=list)  # joints from 1
+    fixed: list[PositiveInt] = Field(default_factory=list)  # joints that do not move
+    mimic: list[Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]] = Field(default_factory=list)
+    chains: list[ChainTable] = Field(default_factory=list)
+    further_probes: list[Point] = Field(default_factory=list)  # of the chains after the first
     urdf: str | None = None  # instead of rows of joints: a URDF beside this file
     base: str | None = None  # its links
-    tip: str | None = None
+    tip: str | list[str] | None = None
     torques: bool = False
     directions: bool = False
     load: bool = False

@@ -13,12 +13,13 @@ from ..core.errors import InputError, naming, nearest
 from ..core.text import printable
 from ..data.capture import Capture
 from ..data.noise import ArmNoise
-from ..kinematics.arm import Arm, correction_names, is_length, reading_as
+from ..kinematics.arm import Arm, correction_names, is_length, reading_as, with_chains
 from ..kinematics.axes_to_dh import without_far_frames
 from ..kinematics.beside import COLUMNS
 from ..kinematics.corrected_arm import loads_of
 from ..kinematics.independence import nearly_parallel
 from ..kinematics.parameters import ArmSpecification, single, with_tool
+from ..kinematics.robots import chain_facts
 from ..uncertainty.target_parameters import determined_parameters, only_targets
 from .arm_tables import GEOMETRY, ArmFile, Identification, NoiseTable
 from .controllers import read_ur_kinematics
@@ -253,14 +254,17 @@ def _arm_of_rows(model: ArmFile) -> Arm:
         beta=None
         if all(row.beta is None for row in rows)
         else [0.0 if row.beta is None else angle * row.beta for row in rows],
-        probe=[length * x for x in model.probe],
+        probe=[length * x for point in (model.probe, *model.further_probes) for x in point],
+        fixed=model.fixed,
+        mimic=[(int(joint), int(source), *rest) for joint, source, *rest in model.mimic],
+        chains=[(chain.name, chain.joints) for chain in model.chains],
         limits=None if rows[0].limits is None else limits,
         prismatic=model.prismatic,
     )
-    far = any(abs(float(arm.d[i - 1])) > _FAR for i in nearly_parallel(arm))
+    far = not arm.chains and any(abs(float(arm.d[i - 1])) > _FAR for i in nearly_parallel(arm))
     # A proposed identification names parameters as the table has them.
     arm = without_far_frames(arm) if far and model.identification is None else arm
-    q = np.random.default_rng(0).uniform(-math.pi, math.pi, (16, arm.joints))
+    q = with_chains(arm, np.random.default_rng(0).uniform(-math.pi, math.pi, (16, arm.joints)))
     reach = float(np.linalg.norm(np.asarray(arm.position(q)), axis=1).max())
     if 0 < reach < _SMALLEST or reach > _LARGEST:
         raise InputError(
@@ -318,15 +322,15 @@ def specification_toml(specification: ArmSpecification, *, source: str = "", pro
     document.update({key: printable(storable(text)) for key, text in named.items() if text})
     document.update({"convention": "standard", "length_unit": "mm", "angle_unit": "rad"})
     geometry = {kind: np.asarray(getattr(arm, kind)).tolist() for kind in GEOMETRY if getattr(arm, kind) is not None}
-    document["probe"] = geometry.pop("probe")
-    facts = {"prismatic": list(arm.prismatic)} | dict.fromkeys(arm.recorded, True)
+    document["probe"] = geometry.pop("probe")[:3]
+    facts = {"prismatic": list(arm.prismatic)} | dict.fromkeys(arm.recorded, True) | chain_facts(arm)
     document.update({key: fact for key, fact in facts.items() if fact})
     rows = tomlkit.array().multiline(True)
     for i in range(arm.joints):
         row = tomlkit.inline_table()
         row.update({kind: values[i] for kind, values in geometry.items()})
         if arm.limits is not None:
-            row["limits"] = list(arm.limits[i])
+            row["limits"] = [-1.0, 1.0] if i + 1 in arm.fixed else list(arm.limits[i])
         rows.append(row)
     document["joint"] = rows
     if arm.corrections is not None:

@@ -17,10 +17,11 @@ from ..data.observations.observation import AbstractObservation
 from ..data.observations.simulated import kinds
 from ..data.recording import ProbedSphere, ReadImage, Recording, checked_sphere
 from ..kinematics.arm import Arm, correction_names, reading_as, readings_unit
-from ..kinematics.beside import BY_JOINT, COLUMNS
+from ..kinematics.beside import BY_JOINT, CHAIN, COLUMNS
 from ..kinematics.corrected_arm import loads_of
 from ..kinematics.parameters import ArmSpecification, UrdfSource, single
 from ..kinematics.priors import Prior
+from ..kinematics.robots import chain_facts
 from .arm_tables import GEOMETRY, with_coefficients
 from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, undamaged, write_tables
 from .records import Field, attribute_name, record_in, row_values, rows_in, rows_table, table_of, values_in
@@ -29,6 +30,7 @@ from .stored_checks import read_checked
 
 _OBSERVATION = "observation_"
 _BESIDE = {  # the variables of what was recorded beside the joints' readings
+    CHAIN: ("chain", "1", "number of the robot's chain that the pose is of, from 0"),
     "torques": ("torque", "N m", "torque of the joint's drive"),
     "directions": (
         "direction",
@@ -202,6 +204,8 @@ def _observation(path: str | os.PathLike, table: StoredTable) -> AbstractObserva
 def _reading_variables(name: str, readings: Float[np.ndarray, "N n"], arm: Arm, rows: str = "pose") -> dict:
     """Readings as variables: those of the joints, and what was recorded beside them."""
     variables = {name: Variable((rows, "joint"), readings[:, : arm.joints], readings_unit(arm), "joint reading")}
+    if arm.chains:
+        variables["chain"] = Variable((rows,), readings[:, arm.joints], *_BESIDE[CHAIN][1:])
     slices = arm.beside.slices(readings.shape[1])
     for beside in arm.beside.names(readings.shape[1]):
         values, (variable, *says) = readings[:, slices[beside]], _BESIDE[beside]
@@ -213,7 +217,7 @@ def _reading_variables(name: str, readings: Float[np.ndarray, "N n"], arm: Arm, 
 
 def _readings_of(table: Mapping[str, np.ndarray], name: str) -> Float[np.ndarray, "N n"]:
     """The readings that `_reading_variables` wrote, with what was recorded beside them."""
-    beside = [table[_BESIDE[column][0]] for column in _recorded(table)]
+    beside = [table[_BESIDE[column][0]] for column in (CHAIN, *COLUMNS) if _BESIDE[column][0] in table]
     return np.column_stack([table[name], *beside]) if beside else table[name]
 
 
@@ -262,6 +266,11 @@ def arm_table(specification: ArmSpecification) -> Table:
     """An arm as a table over ``joint``, with its proposed identification in attributes."""
     arm, prior = single(specification.arm), specification.prior
     values = dict.fromkeys(ARM) | specification._asdict() | {kind: getattr(arm, kind) for kind in GEOMETRY}
+    values |= {"probe": np.asarray(arm.probe)[:3]} | chain_facts(arm)
+    if arm.chains:
+        values["chains"] = [f"{','.join(map(str, joints))} {name}" for name, joints in arm.chains]
+    for flat in {"mimic", "further_probes"} & chain_facts(arm).keys():
+        values[flat] = np.ravel(values[flat]).tolist()
     values |= {"prismatic": arm.prismatic or None} | {name: name in arm.recorded or None for name in COLUMNS}
     if arm.limits is not None:
         values["lowest"], values["highest"] = np.transpose(arm.limits)
@@ -293,11 +302,19 @@ def specification_of(path: str | os.PathLike, stored: Stored, name: str) -> ArmS
     attributes, limits = table.attributes, None
     if "lowest" in table:
         limits = list(zip(table["lowest"].tolist(), table["highest"].tolist(), strict=True))
+    chains = [str(text).partition(" ") for text in attributes.get("chains", ())]
+    geometry = {kind: table.get(kind) if kind == "beta" else table[kind] for kind in GEOMETRY}
+    geometry["probe"] = np.append(table["probe"], attributes.get("further_probes", ()))
     with naming(path):
         arm = Arm(
-            **{kind: table.get(kind) if kind == "beta" else table[kind] for kind in GEOMETRY},
+            **geometry,
             limits=limits,
             prismatic=list(attributes.get("prismatic", ())),
+            fixed=list(attributes.get("fixed", ())),
+            mimic=[
+                (int(i), int(source), *rest) for i, source, *rest in np.reshape(attributes.get("mimic", ()), (-1, 4))
+            ],
+            chains=[(name, joints.split(",")) for joints, _, name in chains],
         )
         arm = reading_as(arm, [name for name in COLUMNS if attributes.get(name, False)])
         if "coefficients" in table:

@@ -12,13 +12,17 @@ import numpy as np
 
 from ..acceptance.results import Measured
 from ..core.errors import InputError, naming, nearest
+from ..core.rotations import roll_pitch_yaw_matrix
 from ..core.text import shorten
 from ..data.capture import Capture, ReferenceLength, check_readings, join_sessions
+from ..data.noise import ArmNoise
 from ..data.observations.held import Socket
 from ..data.recording import ProbedSphere, ReadImage, Recording, checked_sphere
 from ..kinematics.arm import Arm, reading_as
 from ..kinematics.parameters import ArmSpecification
+from ..kinematics.robots import together
 from ..kinematics.workspace import Reach
+from ..model.robot_bases import with_found_bases
 from .arms import arm_beside, for_capture, read_arm, usual_noise
 from .inputs import InputFile
 from .manifest_pixels import Cameras, Detecting, Progress, observations_of, without_progress
@@ -80,8 +84,7 @@ def _read(path: str | os.PathLike, detecting: Detecting = _QUIETLY) -> tuple[Rec
     model = read_toml(manifest := InputFile(path), PosesManifest)
     path = as_path(path)
     with naming(path):
-        arm = arm_beside(path.parent, model.arm)
-        nominal, proposed = read_arm(arm, base=model.base, tip=model.tip, probe=model.probe)
+        nominal, proposed = _nominal(path.parent, model)
         readings = Readings(nominal.arm, model.angles)
         source = Source(manifest, "q", readings)
         sockets, lengths, spheres = _read_recorded(model, source)
@@ -109,7 +112,7 @@ def _read(path: str | os.PathLike, detecting: Detecting = _QUIETLY) -> tuple[Rec
                 "[sessions] applies only to tables with a session, but no table has a session; remove [sessions]."
             )
         capture = _capture(lengths, observed, probe == "remounted")
-        nominal = nominal._replace(arm=reading_as(nominal.arm, readings.beside))
+        nominal = nominal._replace(arm=with_found_bases(reading_as(nominal.arm, readings.beside), capture))
         check_readings(capture, nominal.arm)
         as_found = None if model.as_found is None else _as_found(arm_beside(path.parent, model.as_found), nominal.arm)
         recording = Recording(
@@ -120,12 +123,40 @@ def _read(path: str | os.PathLike, detecting: Detecting = _QUIETLY) -> tuple[Rec
             measured=str(model.date or ""),
             acceptance=(model.acceptance,) if isinstance(model.acceptance, str) else tuple(model.acceptance),
             measuring_range=model.measuring_range,
-            usual=usual_noise(arm, base=model.base, tip=model.tip),
+            usual=None if isinstance(arm := model.arm, dict) else _usual_noise(path.parent, arm, model),
             as_found=as_found,
             stated=_stated(model),
             images=tuple(images),
         )
         return recording, readings
+
+
+def _nominal(folder: Path, model: Any) -> tuple[ArmSpecification, bool]:
+    """The arm that a manifest names, or the robot of several arms, and whether its file proposes an identification."""
+    options = {"base": model.base, "tip": model.tip, "probe": model.probe}
+    if isinstance(model.arm, str):
+        if model.bases:
+            raise InputError("bases are given, but the manifest names one arm; remove bases.")
+        return read_arm(arm_beside(folder, model.arm), **options)
+    arms = {name: read_arm(arm_beside(folder, file), **options)[0].arm for name, file in model.arm.items()}
+    for name in model.bases:
+        if name not in arms:
+            raise InputError(f"bases names the unknown arm '{name}'{nearest(name, arms)}")
+    bases = {name: _base(np.array(numbers)) for name, numbers in model.bases.items()}
+    return ArmSpecification(together(arms, bases=bases), " and ".join(arms)), False
+
+
+def _base(numbers: np.ndarray) -> np.ndarray:
+    """The transform of a position in mm, and roll, pitch and yaw in degrees where they are given."""
+    base = np.eye(4)
+    base[:3, 3] = numbers[:3]
+    if len(numbers) > 3:
+        base[:3, :3] = roll_pitch_yaw_matrix(np.radians(numbers[3:]))
+    return base
+
+
+def _usual_noise(folder: Path, arm: str, model: Any) -> ArmNoise | None:
+    return usual_noise(arm_beside(folder, arm), base=model.base, tip=model.tip)
 
 
 def _stated(model: Any) -> tuple[str, ...]:
@@ -214,6 +245,7 @@ def _read_recorded(
 ) -> tuple[dict[str, _Seated], list[ReferenceLength], tuple[ProbedSphere, ...]]:
     """The sockets, lengths and spheres that a manifest names; names of sockets begin with their session."""
     sockets: dict[str, _Seated] = {}
+    chains: set[tuple[str, str | None]] = set()
     fields: list[dict[str, str]] = []
     for entry in model.socket:
         for values in _fields(source.folder, entry, "socket"):
@@ -224,10 +256,14 @@ def _read_recorded(
                 within = "/".join(filter(None, (named, part.group)))
                 name = "/".join(filter(None, (part.session, within)))
                 check_name(name)
-                if name in sockets:
-                    raise InputError(f"socket '{name}' is defined twice; give its files in one [[socket]].")
                 visits = None if entry.visits is None else part.files
                 poses, target = part.rows[source.quantity], part.rows.get("target", "")
+                if name in sockets:  # two chains of a robot may be in one socket
+                    other = sockets[name]
+                    if (name, entry.chain) in chains or None in (entry.chain, *(chain for _, chain in chains)):
+                        raise InputError(f"socket '{name}' is defined twice; give its files in one [[socket]].")
+                    visits, poses = None, np.concatenate([other.poses, poses])
+                chains.add((name, entry.chain))
                 sockets[name] = _Seated(part.session, within, poses, target, visits)
     spheres = []
     for entry in model.sphere:

@@ -81,6 +81,7 @@ class Table(Strict):
     decimal: Literal[".", ","] | None = None  # None: that of the preset, else a point
     skip: NonNegativeInt = 0
     group: PositiveInt | str | None = None
+    chain: str | None = None  # of a robot: the one that the poses are of
     temperature_C: FiniteFloat | None = None  # of the arm, where the table has no such column
     load_kg: NonNegativeFloat | None = None  # likewise, at the tip
 

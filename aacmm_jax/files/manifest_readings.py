@@ -8,11 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import InputError
-from ..core.text import quoted
+from ..core.text import listed, quoted
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import check_revolutions
 from ..kinematics.arm import Arm
 from ..kinematics.beside import BY_JOINT, COLUMNS
+from ..kinematics.robots import ChainOf, chain_of
 from .manifest_files import as_list
 from .manifest_tables import Angles, PointsTable
 from .table_columns import BESIDE, LINE, header_units, position_columns, proposed_columns, reading_columns
@@ -28,6 +29,7 @@ class Wanted(NamedTuple):
     usual_unit: str | None = None  # of the preset, where neither the manifest nor the header states one
     taken: Sequence[int] = ()  # columns, from 0, that hold something else
     beside: Mapping[str, float | None] = {}  # one value for all rows, of what each row may have in a column
+    chain: str | None = None  # of a robot: the one that the poses are of
 
 
 def checked_unit(
@@ -63,12 +65,14 @@ class Readings:
 
     def __call__(self, text: TextTable, wanted: Wanted) -> Float[np.ndarray, "N n"]:
         """The readings of one table."""
-        stated = wanted.columns
+        stated, arm, chain = wanted.columns, self._arm, self._chain(wanted.chain)
+        if chain is not None:
+            arm = chain.arm
         if stated is None and self._angles is not None and self._angles.columns is not None:
             stated = as_list(self._angles.columns)
-        beside = {name: columns for name in COLUMNS if (columns := self._columns_of(text, name))}
+        beside = {name: columns for name in COLUMNS if (columns := self._columns_of(text, name, arm))}
         by_joint = [i for name in BY_JOINT for i in beside.get(name, [])]
-        picked = reading_columns(text, self._arm.joints, [*wanted.taken, *by_joint], stated)
+        picked = reading_columns(text, arm.joints, [*wanted.taken, *by_joint], stated)
         for name, columns in beside.items():
             if set(columns) & set(picked):
                 raise InputError(
@@ -76,9 +80,9 @@ class Readings:
                     "from the key columns."
                 )
         numbers = text.numbers(picked, measured=True, stated=stated is not None)
-        angles = self._angles_of(text, picked, wanted)
-        q = angles.converted(numbers, self._arm)
-        check_revolutions(str(text.path), q, self._arm, 'correct the header, or write unit = "deg" in [angles]')
+        angles = self._angles_of(text, picked, wanted, arm)
+        q = angles.converted(numbers, arm)
+        check_revolutions(str(text.path), q, arm, 'correct the header, or write unit = "deg" in [angles]')
         recorded = {name: text.numbers(columns) for name, columns in beside.items()}
         for name, value in wanted.beside.items():
             column = stated_or_recorded(value, recorded.get(name), BESIDE[name], str(text.path), len(q))
@@ -94,12 +98,25 @@ class Readings:
                 what = "temperatures" if name == "thermometer" else name
                 add = f"add a column {BESIDE[name]} to {without}, or state {BESIDE[name]} in its table."
             raise InputError(f"{without} has no {what}, but {other} has {what}; {add}")
+        if chain is not None:
+            q = chain.readings(q)
+            by_joint = {name: chain.spread(recorded[name]) for name in BY_JOINT if name in recorded}
+            recorded |= by_joint
         return np.hstack([q, *recorded.values()])
 
-    def _columns_of(self, text: TextTable, name: str) -> list[int]:
+    def _chain(self, stated: str | None) -> ChainOf | None:
+        """The chain of a robot that the manifest states for a table; None for an arm."""
+        if not self._arm.chains and stated is None:
+            return None
+        names = [name for name, _ in self._arm.chains]
+        if stated is None:
+            raise InputError(f"the arm has the chains {listed(names)}; state the chain of the table (chain = ...).")
+        return chain_of(self._arm, stated)
+
+    def _columns_of(self, text: TextTable, name: str, arm: Arm) -> list[int]:
         """The columns of what was recorded beside the readings: those that the manifest names, or that have the usual
         names."""
-        count, stated = self._arm.joints if name in BY_JOINT else 1, getattr(self._angles, name, None)
+        count, stated = arm.joints if name in BY_JOINT else 1, getattr(self._angles, name, None)
         names = [BESIDE[name].format(i + 1) for i in range(count)] if stated is None else as_list(stated)
         if (count == 1 and name == "torques") or (stated is None and not text.has(names)):
             return []
@@ -111,14 +128,14 @@ class Readings:
             )
         return picked
 
-    def _angles_of(self, text: TextTable, picked: Sequence[int], wanted: Wanted) -> Angles:
+    def _angles_of(self, text: TextTable, picked: Sequence[int], wanted: Wanted, arm: Arm) -> Angles:
         """How these readings are written: what the table states comes first, then [angles], the header, the preset.
 
         What the manifest states must not contradict the header.
         """
         angles = self._angles
         unit = wanted.unit or (None if angles is None else angles.unit)
-        angular, linear = header_units(text, picked, self._arm, unit)
+        angular, linear = header_units(text, picked, arm, unit)
         if angular == "counts" and unit is None:
             raise InputError(
                 f'{text.path} has readings in counts; add [angles] with unit = "counts" and counts_per_turn = [...].'

@@ -40,6 +40,12 @@ _Day = Annotated[datetime.date, Field(strict=False), _OF_TIME]
 _ByJoint = PositiveFloat | Annotated[list[PositiveFloat], Field(min_length=1)]
 
 
+def _three_or_six(numbers: list[float]) -> list[float]:
+    if len(numbers) not in (3, 6):
+        raise ValueError("give x, y, z in mm, and roll, pitch, yaw in degrees where the base is turned.")
+    return numbers
+
+
 def _rotation(text: str) -> str:
     if text not in NUMBERS_OF_ROTATION and not _EULER.fullmatch(text):
         raise ValueError(
@@ -207,11 +213,15 @@ class Sessions(Strict):
     probe: Literal["remounted", "same"] = "remounted"
 
 
+Base = Annotated[list[FiniteFloat], AfterValidator(_three_or_six)]
+
+
 class _Poses(Recorded):
-    arm: str
+    arm: str | Annotated[dict[str, str], Field(min_length=1)]  # or arms by the names of a robot's chains
+    bases: dict[str, Base] = Field(default_factory=dict)  # of these arms in that of the first, roughly
     as_found: str | None = None  # the arm with the parameters that its controller had on arrival
     base: str | None = None  # links of a URDF
-    tip: str | None = None
+    tip: str | list[str] | None = None
     probe: Point | None = None  # mm, from the tip link
     acceptance: Standard | Annotated[list[Standard], AfterValidator(each_once)] = Field(default_factory=list)
     measuring_range: PositiveFloat | None = None  # diameter of the measuring volume as the maker states it, mm

@@ -24,6 +24,7 @@ COLUMNS = {  # in the order of the columns, which follow those of the joints: wh
     "thermometer": "a thermometer",
 }
 ALL = tuple(COLUMNS)
+CHAIN = "chain"  # of a robot, and never missing: the number of a pose's chain
 _RANGES = {"torques": (-100.0, 100.0), "directions": (-1.0, 1.0), "load": (0.0, 5.0), "thermometer": (10.0, 30.0)}
 _NEUTRAL = {"thermometer": 20.0}  # where it changes nothing; 0 of the others
 BY_JOINT = ("torques", "directions")  # one column a joint; of others there is one in all

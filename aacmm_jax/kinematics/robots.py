@@ -37,7 +37,7 @@ class ChainOf(NamedTuple):
     joints: tuple[int, ...]  # of the robot, from 1: the joint whose reading each joint of the arm has
     mount: tuple[int, ...]  # fixed joints of the robot that carry the base
     names: Mapping[str, str]  # of the robot's parameter that each parameter of the arm is
-    columns: int  # of the robot's readings
+    robot_joints: int  # of the robot
 
     def readings(self, q: Numbers) -> Float[np.ndarray, "N columns"]:
         """The robot's readings, with the number of the chain, at readings of the chain ``(N, n)``; other joints at
@@ -45,8 +45,12 @@ class ChainOf(NamedTuple):
         given = np.atleast_2d(np.asarray(q, dtype=float))
         if given.shape[-1] != len(self.joints):
             raise InputError(f"q has {given.shape[-1]} columns, but the chain has {len(self.joints)} joints.")
-        whole = np.zeros((len(given), self.columns))
-        whole[:, np.array(self.joints) - 1], whole[:, -1] = given, self.number
+        return np.column_stack([self.spread(given), np.full(len(given), self.number)])
+
+    def spread(self, values: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N joints"]:
+        """Numbers of the chain's joints as those of the robot's; 0 of others."""
+        whole = np.zeros((len(values), self.robot_joints))
+        whole[:, np.array(self.joints) - 1] = values
         return whole
 
     def of_robot(self, q: Numbers) -> Float[np.ndarray, "N n"]:
@@ -108,13 +112,13 @@ def chain_of(robot: Arm, name: str) -> ChainOf:
         limits=limits,
         prismatic=[place[joint] for joint in moving if joint in robot.prismatic],
         fixed=[place[joint] for joint in moving if joint in robot.fixed],
-        mimic=[(place[joint], place[source], *rest) for joint, source, *rest in following],
+        mimic=[(place[joint], place[source], factor, zero) for joint, source, factor, zero in following],
     )
     kinds = _ROW if robot.beta is not None else _ROW[:-1]
     names = {f"{kind}_{i}": f"{kind}_{joint}" for i, joint in enumerate(owner, start=1) for kind in kinds}
     probes = probe_names(len(robot.chains))[3 * number : 3 * number + 3]
     names |= dict(zip(probe_names(1), probes, strict=True))
-    return ChainOf(arm, base, number, tuple(moving), tuple(joints[:start]), names, robot.columns)
+    return ChainOf(arm, base, number, tuple(moving), tuple(joints[:start]), names, robot.joints)
 
 
 def chains_of(robot: Arm) -> dict[str, ChainOf]:
@@ -125,6 +129,15 @@ def chains_of(robot: Arm) -> dict[str, ChainOf]:
 def _rows_of(arm: Arm) -> Float[np.ndarray, "n 5"]:
     beta = np.zeros(arm.joints) if arm.beta is None else arm.beta
     return np.array([np.asarray(x) for x in (arm.theta, arm.d, arm.a, arm.alpha, beta)]).T
+
+
+def chain_facts(arm: Arm) -> dict[str, list]:
+    """What a file states of an arm's fixed and following joints, and of its chains; those that are empty are left
+    out."""
+    further = np.asarray(arm.probe)[3:].reshape(-1, 3).tolist()
+    facts = {"fixed": list(arm.fixed), "mimic": [list(row) for row in arm.mimic], "further_probes": further}
+    facts["chains"] = [{"name": name, "joints": list(joints)} for name, joints in arm.chains]
+    return {name: fact for name, fact in facts.items() if fact}
 
 
 def base_pose(robot: Arm, name: str) -> Transform:
@@ -186,12 +199,12 @@ def together(
     fixed: list[int] = []
     chains: dict[str, list[int]] = {}
 
-    def number_of(key: str, row: Iterable[float], what: str, limit: Iterable[float] = (0.0, 0.0)) -> int:
+    def number_of(key: str, row: Iterable[float], what: str, limit: Sequence[float] = (0.0, 0.0)) -> int:
         values = np.array([*row], dtype=float)
         if key not in place:
             place[key] = len(rows) + 1
             rows.append(values)
-            limits.append((*limit,))
+            limits.append((limit[0], limit[1]))
         elif (wrong := np.flatnonzero(np.abs(rows[place[key] - 1] - values) > _SAME)).size:
             kind = _ROW[wrong[0]]
             raise InputError(
@@ -236,7 +249,7 @@ def together(
         limits=limits,
         prismatic=prismatic,
         fixed=fixed,
-        mimic=[(place[joint], place[source], *rest) for joint, (source, *rest) in (mimic or {}).items()],
+        mimic=[(place[name], place[source], factor, zero) for name, (source, factor, zero) in (mimic or {}).items()],
         chains=chains,
     )
 

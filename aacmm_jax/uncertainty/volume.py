@@ -11,7 +11,7 @@ from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
 from ..core.random_keys import random_generator
-from ..kinematics.arm import Arm, joint_limits
+from ..kinematics.arm import Arm, joint_limits, with_chains
 from ..kinematics.inverse_kinematics import project_to_targets
 from ..kinematics.workspace import total_link_length
 from .arm_uncertainty import Uncertainty
@@ -153,7 +153,7 @@ def sample_lengths(
     allowed = np.asarray(joint_limits(arm, None if limits is None else np.asarray(limits).tolist()))
 
     def draw(m: int) -> Float[np.ndarray, "m n"]:
-        return random.uniform(allowed[:, 0], allowed[:, 1], (m, arm.joints))
+        return with_chains(arm, random.uniform(allowed[:, 0], allowed[:, 1], (m, arm.joints)))
 
     if length is None:
         return draw(count), draw(count)
@@ -178,7 +178,7 @@ def lengths_between(
     """Lengths that begin in one of these poses ``(N, n)``, rad, and end near to another, whose tip is moved along the
     line between both tips until they are so far apart, by at most a third of the length: at most ``count`` of them.
     `InputError` where hardly any two poses are that far apart."""
-    q, random = np.asarray(poses, dtype=float)[:, : arm.joints], random_generator(seed)
+    q, random = np.asarray(poses, dtype=float)[:, : arm.beside.own], random_generator(seed)
     tips = np.asarray(arm.position(q))
     first, second = random.integers(len(q), size=(2, _PAIRS))
     between = tips[second] - tips[first]

@@ -169,7 +169,8 @@ def test_bases_and_chains_are_changed_and_read_back():
 REFUSED = {
     "no such chain": lambda: aj.kinematics.chain_of(ROBOTS["trunk"][1], "middle"),
     "tied parameters differ": lambda: aj.kinematics.together(
-        {"left": LEFT.replace(alpha_1=0.5), "right": RIGHT.replace(alpha_1=0.4)}, joints=NAMES
+        {"left": LEFT.replace(alpha_1=0.5), "right": RIGHT.replace(alpha_1=0.4)},
+        joints={"left": ["t", "s", *"abcd"], "right": ["t", "s", *"efghi"]},
     ),
     "chains meet again": lambda: aj.kinematics.together(TWO, joints=NAMES | {"right": ["t", "r", *"efgh", "c"]}),
     "mimics a joint that is not there": lambda: aj.kinematics.together(TWO, mimic={"a": ("x", 1.0, 0.0)}, joints=NAMES),
