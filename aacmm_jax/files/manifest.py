@@ -66,9 +66,9 @@ def read_manifest(
         (40,)
     """
     manifest = path if isinstance(path, InputFile) else InputFile(path)
-    detecting = Detecting(progress, None if overlays is None else Path(overlays))
+    detecting = Detecting(progress, None if overlays is None else Path(overlays), {})
     recording, readings = _read(manifest, detecting)
-    other = other_readings(manifest, recording, readings.header, lambda changed: _read(changed)[0])
+    other = other_readings(manifest, recording, readings.header, lambda changed: _read(changed, detecting)[0])
     return recording._replace(other_readings=other)
 
 

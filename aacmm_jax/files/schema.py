@@ -55,6 +55,7 @@ IMAGES: Fields = {
     "image": text("name of the image, or number of its pose"),
     "corners": count("number of corners"),
     "refused": text("why the image is not used; empty if it is used"),
+    "preview": text("small picture of the image (JPEG, base64)"),
 }
 
 _COEFFICIENTS = ("coefficient", "coefficient_2")
