@@ -57,10 +57,7 @@ def with_includes(text: str, file: Path) -> str:
         if path in seen:
             raise InputError(f"{where} includes {quoted(name)} a second time; remove one of the two.")
         seen.add(path)
-        try:
-            text = InputFile(path).text
-        except UnicodeDecodeError as error:
-            raise InputError(f"{where} includes {quoted(name)}, which is not UTF-8 text; save it as UTF-8.") from error
+        text = InputFile(path).text
         size[0] += len(text)
         if size[0] > MOST_CHARACTERS:
             raise InputError(

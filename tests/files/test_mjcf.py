@@ -257,7 +257,7 @@ INCLUDED = {
     "missing": ('<include file="missing.xml"/>', ["missing.xml does not exist"]),
     "circle": ('<include file="circle.xml"/>', ["'circle.xml' line 1 includes 'circle.xml' a second time"]),
     "no XML": ('<include file="text.xml"/>', ["not valid XML"]),
-    "no text": ('<include file="bytes.xml"/>', ["includes 'bytes.xml', which is not UTF-8"]),
+    "no text": ('<include file="bytes.xml"/>', ["bytes.xml is not UTF-8 text"]),
 }
 
 
