@@ -1,4 +1,4 @@
-"""Arms in TOML files, one row per joint or a URDF, URDF files, and the arms that ship with the package."""
+"""Arms in TOML files, one row per joint or a URDF, files of robots, and the arms that ship with the package."""
 
 import math
 import os
@@ -23,13 +23,13 @@ from ..kinematics.robots import chain_facts
 from ..uncertainty.target_parameters import determined_parameters, only_targets
 from .arm_tables import GEOMETRY, ArmFile, Identification, NoiseTable
 from .controllers import read_ur_kinematics
+from .inputs import ROBOT_FILES
 from .outputs import as_path, storable, write_text
 from .toml import read_toml
 from .urdf_robots import read_urdf
 
 _SHIPPED = Path(__file__).with_name("shipped_arms")
-_ROBOTS = (".urdf", ".xacro")  # the latter for the message that says how to expand it
-_OTHER_FORMATS = (*_ROBOTS, ".yaml", ".yml")
+_OTHER_FORMATS = (*ROBOT_FILES, ".yaml", ".yml")
 _SMALLEST, _LARGEST = 5.0, 50_000.0  # mm: no arm's tip is always as near its base, or ever as far
 _FAR = 10_000.0  # mm: no link is as long, but frames on nearly parallel axes may be as far away
 
@@ -61,11 +61,12 @@ def load_arm(
     and in the first D-H frame otherwise (`files.urdf_chain` has the transform); readings are the URDF's joint values.
 
     Args:
-        source: Name of a shipped arm (``"cheng2018-simulation"``), or path of a TOML file, a URDF, or a Universal
-            Robots ``kinematics.yaml``.
-        base: Of a URDF: the link that does not move; by default its root.
+        source: Name of a shipped arm (``"cheng2018-simulation"``), or path of a TOML file, a URDF, MJCF (``.xml``),
+            or a Universal Robots ``kinematics.yaml``.
+        base: Of a URDF: the link that does not move; by default its root. Of MJCF: a body, by default ``"world"``.
         tip: Of a URDF: the link at the end, or those at the ends of a robot's chains, which are named after them; by
-            default the links that have no link after them, one for each chain of joints.
+            default the links without one after them, one for each chain of joints. Of MJCF likewise: bodies or sites,
+            by default bodies.
         probe: A tool's tip ``(3,)`` in the frame of the last link, mm; by default that frame's origin. Not of an arm
             file that states one.
 
@@ -179,10 +180,10 @@ def read_arm(
     """The arm of a file as `load_specification` takes it, and whether the file proposes an identification."""
     path = _path_of(source)
     suffix = path.suffix.lower()
-    if suffix in _ROBOTS:
+    if suffix in ROBOT_FILES:
         return read_urdf(path, base=base, tip=tip, probe=probe), False
     if base is not None or tip is not None:
-        raise InputError(f"{source} is not a URDF, but base and tip name links of a URDF; omit base and tip.")
+        raise InputError(f"{source} is not a URDF or MJCF, but base and tip name links of one; omit base and tip.")
     if suffix in _OTHER_FORMATS:
         return read_ur_kinematics(path, probe=probe), False
     if suffix != ".toml" and not os.path.exists(path):

@@ -1,4 +1,4 @@
-"""Robots of several chains in a URDF: the chains from one base to several tips as one arm."""
+"""Robots of several chains in a URDF or MJCF: the chains from one base to several tips as one arm."""
 
 import os
 from collections.abc import Sequence
@@ -12,8 +12,10 @@ from ..kinematics.axes_to_dh import inverse
 from ..kinematics.parameters import ArmSpecification, UrdfSource, with_tool
 from ..kinematics.robots import together
 from .inputs import InputFile
+from .mjcf import with_includes
+from .mjcf_text import parse_robot
 from .urdf import UrdfChain, ends_of, joints_between, listed_links, mimic_of, urdf_chain
-from .urdf_text import Robot, parse_urdf
+from .urdf_text import Robot
 
 
 def read_urdf(
@@ -23,7 +25,7 @@ def read_urdf(
     tip: str | Sequence[str] | None = None,
     probe: Numbers | None = None,
 ) -> ArmSpecification:
-    """The arm of a serial chain of a URDF, or the robot of several, in the first D-H frame, with the text of the file;
+    """The arm of a serial chain of a URDF or MJCF, or the robot of several, in the first D-H frame, with the text of the file;
     arguments as of `load_arm`."""
     file = InputFile(path)
     with naming(path):
@@ -31,12 +33,13 @@ def read_urdf(
             text = file.content.decode("utf-8")
         except UnicodeDecodeError as error:
             raise InputError("the file is not UTF-8 text; save it as UTF-8.") from error
-        robot, given = parse_urdf(text), () if tip is None else (tip,) if isinstance(tip, str) else tuple(tip)
+        text = with_includes(text, Path(file))
+        robot, given = parse_robot(text), () if tip is None else (tip,) if isinstance(tip, str) else tuple(tip)
         base, tips = ends_of(robot, base, given)
         chosen = tips if given else moving_tips(robot, base, tips)
         if len(chosen) < min(2, len(tips)):
             raise InputError(
-                f"the URDF has several links at the end of the same joints, {listed_links(tips)}; choose the tip (tip= "
+                f"the file has several links at the end of the same joints, {listed_links(tips)}; choose the tip (tip= "
                 "or --tip)."
             )
         source = UrdfSource(text, base, "\n".join(dict.fromkeys(chosen)))

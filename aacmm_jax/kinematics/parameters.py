@@ -1,5 +1,6 @@
 """Which parameters of an arm are free, within what bounds, and what the file of an arm proposes for both."""
 
+import re
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from types import MappingProxyType
@@ -36,6 +37,7 @@ from .jacobian import Indices
 from .priors import Prior
 from .robots import default_names, plain_held
 
+_MJCF = re.compile(r"(?:[^<]++|(?><!--.*?-->)|(?><\?.*?\?>))*+<mujoco\b", re.DOTALL)
 _HalfWidth = Annotated[float, Range(least=0, infinite=True)]
 
 
@@ -297,9 +299,9 @@ def perturbed_arm(space: Parameters, *, length: NotNegative, angle: NotNegative,
 
 
 class UrdfSource(NamedTuple):
-    """The URDF that an arm was read from: what is needed to write one with the calibrated arm."""
+    """The URDF or MJCF that an arm was read from: what is needed to write one with the calibrated arm."""
 
-    text: str  # the whole file
+    text: str  # the whole file, and what it includes
     base: str  # name of the link that does not move
     tip: str  # name of the link at the end of the chain; of a robot those of all chains, one a line
 
@@ -307,6 +309,11 @@ class UrdfSource(NamedTuple):
     def tips(self) -> tuple[str, ...]:
         """Names of the links at the ends of the chains."""
         return tuple(self.tip.split("\n"))
+
+    @property
+    def format(self) -> str:
+        """``"URDF"`` or ``"MJCF"``, as the root element says."""
+        return "MJCF" if _MJCF.match(self.text) else "URDF"
 
 
 class ArmSpecification(NamedTuple):
