@@ -25,8 +25,9 @@ from ..kinematics.axes_to_dh import (
     same_transform,
     tip_frame,
 )
-from ..kinematics.chain import JointKinds
+from ..kinematics.chain import Geometry, JointKinds
 from ..kinematics.parameters import ArmSpecification, UrdfSource, single
+from ..kinematics.robots import chain_of
 from .mjcf import edited_mjcf
 from .mjcf_text import parse_robot
 from .outputs import write_text
@@ -168,8 +169,8 @@ def urdf_of(arm: Arm, nominal: ArmSpecification) -> ExportedUrdf:
     The base link stays, and a joint's frame moves along its axis, and turns about it, no more than the calibration
     says: no data on the tip determine that. The zero offset of a prismatic joint shifts its frame along its axis. Where
     the arm has a tool beyond the tip link, or no fixed joint ends at the tip link, the calibrated tip is the origin of
-    a link that is added. In MJCF, the bodies have the origins, sites are links, and files that were included stand in
-    the text.
+    a link that is added. The base of an arm of a robot is the origin of its first joint. In
+    MJCF, the bodies have the origins, sites are links, and files that were included stand in the text.
 
     Args:
         arm: The calibrated arm.
@@ -185,24 +186,51 @@ def urdf_of(arm: Arm, nominal: ArmSpecification) -> ExportedUrdf:
         raise InputError(
             "the nominal arm was not read from a URDF or MJCF, so a URDF cannot be exported; choose --format toml."
         )
-    chain = urdf_chain(nominal.urdf)
-    if single(arm).joints != len(chain.joints):
+    source, probes = nominal.urdf, np.asarray(nominal.arm.probe).reshape(-1, 3)
+    wanted = {"joints": single(arm).joints, "chains": [name for name, _ in arm.chains]}
+    if wanted != {"joints": nominal.arm.joints, "chains": [name for name, _ in nominal.arm.chains]}:
         raise InputError(
-            f"the arm has {arm.joints} joints, but the chain has {len(chain.joints)}; give an arm that was "
+            f"the arm has {arm.joints} joints, but that of the file has {nominal.arm.joints}; give an arm that was "
             "calibrated from this file."
         )
-    before, after = geometry_of(chain.arm), geometry_of(arm)
-    frames = calibrated_frames(chain.origins, before, after, chain.base)
+    if not arm.chains:
+        chain = urdf_chain(source)
+        return _exported(source, chain, geometry_of(arm), chain.base, (), probes[0])
+    first, plain = urdf_chain(source._replace(tip=source.tips[0]), alone=False).base, arm.replace(mimic=())
+    tips, changed, notes = [], {}, []
+    text = source.text
+    for tip, probe in zip(source.tips, probes, strict=True):
+        part, chain = chain_of(plain, tip), urdf_chain(source._replace(tip=tip), alone=False)
+        branching = [i for i, joint in enumerate(part.joints) if part.names[f"theta_{i + 1}"] != f"theta_{joint}"]
+        one = source._replace(text=text, tip=tip)
+        exported = _exported(one, chain, geometry_of(part.arm), first @ part.base, branching, probe)
+        text, tips, notes = exported.text, [*tips, exported.tip], [*notes, *exported.notes]
+        changed |= dict.fromkeys(exported.changed)
+    return ExportedUrdf(text, ", ".join(tips), tuple(changed), tuple(notes))
+
+
+def _exported(
+    source: UrdfSource,
+    nominal: UrdfChain,
+    after: Geometry,
+    base: Transform,
+    branching: Sequence[int],
+    probe: Float[np.ndarray, " 3"],
+) -> ExportedUrdf:
+    """The text with the origins of one calibrated chain on its calibrated base; its joints after which chains separate
+    (from 0) do not turn with the zero offset, which is another one in each chain. ``probe`` is the nominal one."""
+    before = geometry_of(nominal.arm)
+    frames = calibrated_frames(nominal.origins, before, after, nominal.base, base, branching)
     last = inverse(reduce(np.matmul, frames, np.eye(4)))
-    tool = np.asarray(nominal.arm.probe) - np.asarray(chain.arm.probe)
-    has_tool = bool(np.linalg.norm(tool) > 1e-9)
-    tip = last @ tip_frame(after, chain.base)
+    has_tool = bool(np.linalg.norm(probe - np.asarray(before.probe)) > 1e-9)
+    tip = last @ tip_frame(after, base)
     # A tool is no part of the file: the tip link then follows the last D-H frame alone.
-    link = last @ tip_frame(after._replace(probe=before.probe), chain.base) if has_tool else tip
-    if nominal.urdf.format == "MJCF":
-        path = joints_between(chain.robot, nominal.urdf.base, nominal.urdf.tip)
-        return edited_mjcf(nominal.urdf.text, chain.robot, path, frames, link, tip)
-    return _edited_urdf(nominal.urdf, chain, frames, link, tip)
+    link = last @ tip_frame(after._replace(probe=before.probe), base) if has_tool else tip
+    chain = urdf_chain(source, alone=False)  # as the text has it, which other chains may have changed
+    if source.format == "MJCF":
+        path = joints_between(chain.robot, source.base, source.tip)
+        return edited_mjcf(source.text, chain.robot, path, frames, link, tip)
+    return _edited_urdf(source, chain, frames, link, tip)
 
 
 def _edited_urdf(

@@ -25,8 +25,8 @@ def read_urdf(
     tip: str | Sequence[str] | None = None,
     probe: Numbers | None = None,
 ) -> ArmSpecification:
-    """The arm of a serial chain of a URDF or MJCF, or the robot of several, in the first D-H frame, with the text of the file;
-    arguments as of `load_arm`."""
+    """The arm of a serial chain of a URDF or MJCF, or the robot of several, in the first D-H frame, with the text of
+    the file; arguments as of `load_arm`."""
     file = InputFile(path)
     with naming(path):
         try:

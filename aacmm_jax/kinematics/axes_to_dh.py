@@ -6,6 +6,7 @@ other descriptions (URDF) by habit. So a conversion keeps both, and `calibrated_
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -208,24 +209,34 @@ def without_far_frames(arm: Arm) -> Arm:
 
 
 def calibrated_frames(
-    origins: list[Transform], nominal: Geometry, calibrated: Geometry, base: Transform
+    origins: list[Transform],
+    nominal: Geometry,
+    calibrated: Geometry,
+    base: Transform,
+    calibrated_base: Transform | None = None,
+    branching: Sequence[int] = (),
 ) -> list[Transform]:
     """Origins of the joints of a calibrated chain, each in the frame of the joint before it, at reading 0; mm.
 
     A frame on axis i turns about its axis with theta_i, so that a link keeps its shape where only zero offsets changed,
     and is where the axis passes nearest to the nominal origin, as the calibrated joint before it carries that; that of
     a prismatic joint moves on along its axis with d_i, for the same reason. An origin that does not change comes back
-    as it was, to the bit. ``nominal`` and ``base`` are what `dh_of_axes` gave; calibration does not change ``base``.
+    as it was, to the bit. ``nominal`` and ``base`` are what `dh_of_axes` gave; calibration changes ``base`` only of an
+    arm that stands beside another one. Joints from 0 that are ``branching`` neither turn nor slide by their offset.
     """
-    before, after = dh_frames(nominal, base), dh_frames(calibrated, base)
+    before, after = (
+        dh_frames(nominal, base),
+        dh_frames(calibrated, base if calibrated_base is None else calibrated_base),
+    )
     was, now, changed = np.eye(4), np.eye(4), []
     for i, origin in enumerate(origins):
         was, expected = was @ origin, now @ origin
-        turn = rotation(2, float(calibrated.theta[i] - nominal.theta[i]))
+        own = i not in branching
+        turn = rotation(2, float(calibrated.theta[i] - nominal.theta[i]) if own else 0.0)
         frame = after[i] @ turn @ inverse(before[i]) @ was
         point, axis = after[i][:3, 3], after[i][:3, 2]
         slides = nominal.kinds is not None and nominal.kinds.prismatic[i]
-        offset = float(calibrated.d[i] - nominal.d[i]) if slides else 0.0
+        offset = float(calibrated.d[i] - nominal.d[i]) if slides and own else 0.0
         frame[:3, 3] = point + ((expected[:3, 3] - point) @ axis + offset) * axis
         unchanged = same_transform(frame, expected)
         changed.append(origin if unchanged else inverse(now) @ frame)

@@ -221,9 +221,7 @@ def together(
             for i, row in enumerate(mount_rows(base)):
                 numbers.append(number_of(f"{chain[0]} < {i}", row, chain[0]))
                 fixed.append(numbers[-1])
-        reach = (
-            joint_limits(arm, None) if arm.prismatic or arm.limits is not None else [(-math.pi, math.pi)] * arm.joints
-        )
+        reach = joint_limits(arm, None).tolist()
         for i, (joint, row) in enumerate(zip(chain, _rows_of(arm), strict=True)):
             branches = len(after[joint]) > 1
             numbers.append(number_of(joint, np.zeros(5) if branches else row, joint, reach[i]))
