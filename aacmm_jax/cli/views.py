@@ -201,6 +201,8 @@ def _observations(summary: dict[str, Any]) -> View:
                 f"--json also shows {pluralise(hidden, 'more part')} of the geometry, including the positions of the "
                 "sockets."
             )
+    if summary.get("robot_bases"):
+        yield tables.robot_bases_table(summary["robot_bases"], factor)
     if summary.get("base"):
         yield tables.base_table(summary["base"][:_MOST_PARTS], factor)
     if summary["robust"]:

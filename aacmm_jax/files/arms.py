@@ -257,7 +257,7 @@ def _arm_of_rows(model: ArmFile) -> Arm:
         else [0.0 if row.beta is None else angle * row.beta for row in rows],
         probe=[length * x for point in (model.probe, *model.further_probes) for x in point],
         fixed=model.fixed,
-        mimic=[(int(joint), int(source), *rest) for joint, source, *rest in model.mimic],
+        mimic=[(int(joint), int(source), factor, offset) for joint, source, factor, offset in model.mimic],
         chains=[(chain.name, chain.joints) for chain in model.chains],
         limits=None if rows[0].limits is None else limits,
         prismatic=model.prismatic,

@@ -266,11 +266,10 @@ def arm_table(specification: ArmSpecification) -> Table:
     """An arm as a table over ``joint``, with its proposed identification in attributes."""
     arm, prior = single(specification.arm), specification.prior
     values = dict.fromkeys(ARM) | specification._asdict() | {kind: getattr(arm, kind) for kind in GEOMETRY}
-    values |= {"probe": np.asarray(arm.probe)[:3]} | chain_facts(arm)
+    values |= {"probe": np.asarray(arm.probe)[:3]} | (facts := chain_facts(arm))
     if arm.chains:
         values["chains"] = [f"{','.join(map(str, joints))} {name}" for name, joints in arm.chains]
-    for flat in {"mimic", "further_probes"} & chain_facts(arm).keys():
-        values[flat] = np.ravel(values[flat]).tolist()
+    values |= {name: np.ravel(facts[name]).tolist() for name in {"mimic", "further_probes"} & facts.keys()}
     values |= {"prismatic": arm.prismatic or None} | {name: name in arm.recorded or None for name in COLUMNS}
     if arm.limits is not None:
         values["lowest"], values["highest"] = np.transpose(arm.limits)
@@ -311,10 +310,8 @@ def specification_of(path: str | os.PathLike, stored: Stored, name: str) -> ArmS
             limits=limits,
             prismatic=list(attributes.get("prismatic", ())),
             fixed=list(attributes.get("fixed", ())),
-            mimic=[
-                (int(i), int(source), *rest) for i, source, *rest in np.reshape(attributes.get("mimic", ()), (-1, 4))
-            ],
-            chains=[(name, joints.split(",")) for joints, _, name in chains],
+            mimic=[(int(i), int(j), x, y) for i, j, x, y in np.reshape(attributes.get("mimic", ()), (-1, 4)).tolist()],
+            chains=[(name, [int(i) for i in joints.split(",")]) for joints, _, name in chains],
         )
         arm = reading_as(arm, [name for name in COLUMNS if attributes.get(name, False)])
         if "coefficients" in table:

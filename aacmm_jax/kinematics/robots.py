@@ -12,6 +12,7 @@ base are determined, however the arm is mounted.
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from .arm import Arm, joint_limits, parameter_names, probe_names, value_of
 from .axes_to_dh import Transform, dh_link, rotation
 
 _ROW = ("theta", "d", "a", "alpha", "beta")
+_STEP = 1e-4  # mm and rad, of derivatives
 _SAME = 1e-9  # mm and rad: tied parameters that differ by more are different
 _MOUNT = (("d", "a"), ("a",), ("theta", "alpha", "beta"))  # the free parameters of the fixed joints below a base
 
@@ -83,9 +85,7 @@ def chain_of(robot: Arm, name: str) -> ChainOf:
     number, (_, joints) = numbers.index(name), robot.chains[numbers.index(name)]
     rows = _rows_of(robot)
     start = next(place for place, joint in enumerate(joints) if joint not in robot.fixed)
-    base = np.eye(4)
-    for joint in joints[:start]:
-        base = base @ dh_link(*rows[joint - 1])
+    base = _product(rows, joints[:start])
     links, moving, owner = [], [], []
     for joint in joints[start:]:
         theta, d, a, alpha, beta = row = rows[joint - 1]
@@ -138,11 +138,6 @@ def chain_facts(arm: Arm) -> dict[str, list]:
     facts = {"fixed": list(arm.fixed), "mimic": [list(row) for row in arm.mimic], "further_probes": further}
     facts["chains"] = [{"name": name, "joints": list(joints)} for name, joints in arm.chains]
     return {name: fact for name, fact in facts.items() if fact}
-
-
-def base_pose(robot: Arm, name: str) -> Transform:
-    """The base of a chain in the base of the robot, mm."""
-    return chain_of(robot, name).base
 
 
 def together(
@@ -286,6 +281,26 @@ def mount_names(chain: ChainOf) -> list[str]:
     """The six parameters of the robot that say where the base of a chain is; none of the robot's own base."""
     free = zip(chain.mount, _MOUNT, strict=True) if chain.mount else ()
     return [f"{kind}_{joint}" for joint, kinds in free for kind in kinds]
+
+
+def base_derivatives(robot: Arm, chain: ChainOf, names: Sequence[str]) -> Float[np.ndarray, "6 p"]:
+    """How the base of a chain moves with parameters of the robot: its position, and a small rotation about the axes of
+    the robot's base; mm and rad."""
+    derivatives = np.zeros((6, len(names)))
+    for place in np.flatnonzero(np.isin(names, mount_names(chain))):
+        ends = []
+        for step in (_STEP, -_STEP):
+            moved = robot.replace(**{names[place]: value_of(robot, names[place]) + step})
+            ends.append(_product(_rows_of(moved), chain.mount))
+        turn = (ends[0][:3, :3] - ends[1][:3, :3]) @ chain.base[:3, :3].T / (2 * _STEP)
+        derivatives[:3, place] = (ends[0][:3, 3] - ends[1][:3, 3]) / (2 * _STEP)
+        derivatives[3:, place] = turn[2, 1], turn[0, 2], turn[1, 0]
+    return derivatives
+
+
+def _product(rows: Float[np.ndarray, "n 5"], joints: Sequence[int]) -> Transform:
+    """The transform of fixed joints, from 1."""
+    return reduce(np.matmul, [dh_link(*rows[joint - 1]) for joint in joints], np.eye(4))
 
 
 def with_bases(robot: Arm, bases: Mapping[str, Transform]) -> Arm:

@@ -10,7 +10,7 @@ from ..calibration.evaluation import Evaluation
 from ..calibration.pose_table import HELD_OUT, USED, PoseResiduals
 from ..calibration.record import REPEATABILITY, CalibrationRecord
 from ..calibration.results import ObservedMetrics
-from ..core.rotations import inverse_frame
+from ..core.rotations import inverse_frame, rotation_vector
 from ..core.text import csv_text
 from ..data.capture import Capture
 from ..data.observations.observation import (
@@ -24,6 +24,8 @@ from ..data.observations.observation import (
 )
 from ..diagnostics.contradictions import session_metrics
 from ..diagnostics.pose_residuals import ObservationResiduals, distances_of, observation_residuals, rms
+from ..kinematics.arm import without_corrections
+from ..kinematics.robots import base_derivatives, chains_of
 from ..model.observed import Observed
 from ..pipeline.hold_out import residuals_of
 from .tables import OTHER_RMS, attributes, observed_words, plain, rows_of
@@ -94,6 +96,7 @@ def observed_summary(record: CalibrationRecord, nominal: Evaluation) -> dict[str
             for session, (poses, together, alone) in session_metrics(record).items()
         ],
         "removed": [plain(group._asdict()) for group in record.removed],
+        "robot_bases": robot_base_rows(record),
     }
     if not record.sockets_alone:
         residuals = observation_residuals(record)
@@ -201,6 +204,23 @@ def _geometry(capture: Capture, metrics: ObservedMetrics) -> list[dict[str, Any]
                 "certified_u": None if stated_u is None else np.asarray(stated_u).tolist(),
             }
     return [parts[part] for part in observed.blocks]
+
+
+def robot_base_rows(record: CalibrationRecord) -> list[dict[str, Any]]:
+    """The base of each chain of a robot in that of the first, k = 1; rotations as vectors, with u about the axes of the
+    first base."""
+    robot, rows = record.calibrated.arm, []
+    if robot.corrections is not None:
+        robot = without_corrections(robot)
+    for name, chain in chains_of(robot).items():
+        if chain.mount:
+            by = base_derivatives(robot, chain, record.names)
+            u = plain(np.sqrt(np.diag(by @ np.asarray(record.covariance) @ by.T)))
+            turn = np.asarray(rotation_vector(chain.base[:3, :3]))
+            row = {"in": name, "of": robot.chains[0][0], "position_mm": chain.base[:3, 3].tolist()}
+            row |= {"position_u_mm": u[:3], "rotation_rad": turn.tolist(), "rotation_u_rad": u[3:]}
+            rows.append(row)
+    return rows
 
 
 def _base_rows(record: CalibrationRecord) -> list[dict[str, Any]]:

@@ -188,7 +188,12 @@ def harmonics_table(rows: Rows) -> Table:
     })  # fmt: skip
 
 
-def base_table(frames: Rows, factor: float) -> Table:
+def robot_bases_table(bases: Rows, factor: float) -> Table:
+    """Where the bases of a robot's chains are, with their expanded uncertainty."""
+    return base_table(bases, factor, f"Base of each chain in the base frame of '{bases[0]['of']}', with {U_AT_LEVEL}")
+
+
+def base_table(frames: Rows, factor: float, caption: str = "") -> Table:
     """Where the base is in each frame of known coordinates, with its expanded uncertainty."""
     rows = []
     for frame in frames:
@@ -200,8 +205,8 @@ def base_table(frames: Rows, factor: float) -> Table:
             pairs = list(zip(frame[quantity.format("")], expanded, strict=True))
             rows.append((name, title, *(number(scale * x, decimals_for(u), rounded=True) for x, u in pairs)))
             rows.append(("", "U", *(number(u, decimals_for(u)) for u in expanded)))
-    title = f"Pose of the base frame in each frame with known coordinates, with {U_AT_LEVEL}"
-    return listed(title, rows, ("in", "", "x", "y", "z"))
+    usual = f"Pose of the base frame in each frame with known coordinates, with {U_AT_LEVEL}"
+    return listed(caption or usual, rows, ("of" if caption else "in", "", "x", "y", "z"))
 
 
 def volume_table(caption: str, volume: Row) -> Table:

@@ -1,0 +1,172 @@
+"""Robots of several chains in files: URDF with several tips, manifests with a chain, and what is stored of them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.files.arms import specification_toml
+from aacmm_jax.kinematics.parameters import ArmSpecification
+
+LIMIT = '<limit lower="-2" upper="2"/>'
+
+
+def joint(name: str, kind: str, parent: str, child: str, origin: str, more: str = "") -> str:
+    """A joint of a URDF."""
+    ends = f'<parent link="{parent}"/><child link="{child}"/>'
+    return f'<link name="{child}"/><joint name="{name}" type="{kind}">{ends}<origin {origin}/>{more}</joint>'
+
+
+SIDES = "".join(
+    joint(f"{side}1", "revolute", "trunk", f"{side}a", f'xyz="0 {y} 0.1" rpy="{y} 0 0"', f'<axis xyz="0 0 1"/>{LIMIT}')
+    + joint(f"{side}2", "revolute", f"{side}a", f"{side}b", 'xyz="0.3 0 0.1" rpy="1.5 0.2 0"', LIMIT)
+    + joint(f"{side}3", "revolute", f"{side}b", f"{side}c", 'xyz="0.3 0.1 0" rpy="0.1 1.2 0"', LIMIT)
+    + joint(f"{side}4", "fixed", f"{side}c", f"{side}_tool", 'xyz="0.2 0.1 0.1"')
+    for side, y in (("left", 0.2), ("right", -0.2))
+)
+LIFT = joint("lift", "prismatic", "base", "trunk", 'xyz="0 0 0.3" rpy="0 0.1 0"', f'<axis xyz="0 0 1"/>{LIMIT}')
+MIMIC = '<mimic joint="right3" multiplier="-0.5" offset="0.1"/>'
+FINGER = joint("finger", "prismatic", "right_tool", "finger", 'xyz="0.05 0 0"', LIMIT + MIMIC)
+ROBOT = (
+    f'<robot name="two"><link name="base"/>{LIFT}{SIDES}{FINGER}{joint("c", "fixed", "trunk", "camera", "")}</robot>'
+)
+
+
+@pytest.fixture
+def urdf(tmp_path: Path) -> Path:
+    """A trunk on a lift with two arms, one of which has a finger that follows another joint."""
+    path = tmp_path / "two.urdf"
+    path.write_text(ROBOT)
+    return path
+
+
+def readings(robot: aj.Arm) -> np.ndarray:
+    """Readings of all joints, with a chain that takes turns."""
+    q = np.random.default_rng(0).uniform(-1, 1, (6, robot.joints))
+    return np.column_stack([q, np.arange(6) % len(robot.chains)])
+
+
+def test_several_tips_are_a_robot(urdf):
+    robot = aj.load_arm(urdf)
+    assert [name for name, _ in robot.chains] == ["left_tool", "finger"]
+    (followed,) = robot.mimic
+    assert followed[2:] == (-500.0, 100.0)  # mm by rad, and mm
+    for tips in (["left_tool", "right_tool"], ["right_tool", "left_tool"]):
+        chosen = aj.load_arm(urdf, tip=tips)
+        for tip in tips:
+            plain, chain = aj.load_arm(urdf, tip=tip), aj.kinematics.chain_of(chosen, tip)
+            q = np.random.default_rng(1).uniform(-1, 1, (5, plain.joints))
+            np.testing.assert_allclose(chosen.pose(chain.readings(q)), plain.pose(q), atol=1e-9)
+
+
+def test_a_calibrated_robot_is_written_back(urdf):
+    nominal = aj.files.load_specification(urdf)
+    assert aj.files.urdf_of(nominal.arm, nominal).text == ROBOT
+    calibrated = aj.perturbed_arm(aj.Parameters.free_of(nominal.arm), length=3.0, angle=0.01, seed=1)
+    exported = aj.files.save_urdf(calibrated, urdf.with_name("calibrated.urdf"), nominal=nominal)
+    assert "lift" not in exported.changed
+    again, q = aj.load_arm(urdf.with_name("calibrated.urdf")), readings(calibrated)
+    np.testing.assert_allclose(again.pose(q), calibrated.pose(q), atol=1e-9)
+
+
+def test_the_base_of_an_arm_beside_another_is_written_back(tmp_path):
+    path = tmp_path / "table.urdf"
+    path.write_text(ROBOT.replace(LIFT, joint("lift", "fixed", "base", "trunk", 'xyz="0 0 0.3"')))
+    nominal = aj.files.load_specification(path, tip=["left_tool", "right_tool"])
+    calibrated = aj.perturbed_arm(aj.Parameters.free_of(nominal.arm), length=3.0, angle=0.01, seed=1)
+    path.write_text(aj.files.urdf_of(calibrated, nominal).text)
+    q = readings(calibrated)
+    np.testing.assert_allclose(
+        aj.load_arm(path, tip=["left_tool", "right_tool"]).pose(q), calibrated.pose(q), atol=1e-9
+    )
+
+
+def test_toml_and_captures_keep_a_robot(urdf, tmp_path):
+    robot = aj.load_arm(urdf)
+    (tmp_path / "robot.toml").write_text(specification_toml(ArmSpecification(robot, "two")))
+    again = aj.load_arm(tmp_path / "robot.toml")
+    facts = ("chains", "fixed", "mimic", "prismatic", "limits")
+    assert [getattr(again, fact) for fact in facts] == [getattr(robot, fact) for fact in facts]
+    q = readings(robot)
+    np.testing.assert_array_equal(again.position(q), robot.position(q))
+    recording = aj.data.Recording(aj.Capture({"A": q}), ArmSpecification(robot, "two"))
+    aj.files.save_capture(tmp_path / "capture.h5", recording)
+    stored = aj.files.load_capture(tmp_path / "capture.h5")
+    np.testing.assert_array_equal(stored.capture.sockets["A"], q)
+    np.testing.assert_array_equal(stored.nominal.arm.position(q), robot.position(q))
+    assert [getattr(stored.nominal.arm, fact) for fact in facts] == [getattr(robot, fact) for fact in facts]
+
+
+MANIFEST = """arm = { left = "panda", right = "panda" }
+bases = { right = [0, -700, 0, 0, 0, 10] }
+angles = { unit = "rad" }
+socket = [
+  { name = "A", file = "left_A.csv", chain = "left" },
+  { name = "A", file = "right_A.csv", chain = "right" },
+  { name = "B", file = "left_B.csv", chain = "left" },
+  { name = "B", file = "right_B.csv", chain = "right" },
+  { name = "C", file = "left_C.csv", chain = "left" },
+  { name = "C", file = "right_C.csv", chain = "right" },
+]
+"""
+
+
+@pytest.fixture
+def two_arms(tmp_path: Path) -> tuple[Path, np.ndarray]:
+    """A manifest of two arms that were in the same three sockets, and the base of the second."""
+    panda = aj.load_arm("panda")
+    base = np.eye(4)
+    base[:3, :3], base[:3, 3] = aj.kinematics.axes_to_dh.rotation(2, 0.2)[:3, :3], (40.0, -820.0, 5.0)
+    robot = aj.kinematics.together({"left": panda, "right": panda}, bases={"right": base})
+    places = {"A": (450, -350, 300), "B": (500, -450, 200), "C": (400, -400, 400)}
+    capture = aj.simulate(robot, places, poses=8)
+    for socket, q in capture.sockets.items():
+        for number, (name, _) in enumerate(robot.chains):
+            own = aj.kinematics.chain_of(robot, name).of_robot(np.asarray(q)[np.asarray(q)[:, -1] == number])
+            np.savetxt(tmp_path / f"{name}_{socket}.csv", own, delimiter=",")
+    (tmp_path / "two.toml").write_text(MANIFEST)
+    return tmp_path / "two.toml", base
+
+
+def test_bases_are_found_from_what_two_arms_touched(two_arms):
+    path, base = two_arms
+    recording = aj.files.read_manifest(path)
+    assert recording.capture.sizes == (16, 16, 16)
+    np.testing.assert_allclose(aj.kinematics.chain_of(recording.nominal.arm, "right").base, base, atol=1e-6)
+
+
+REFUSED = {
+    'chain = "left" }': ('chain = "middle" }', "has no chain 'middle'"),
+    ', chain = "left"': ("", "state the chain"),
+    "bases = { right": ("bases = { wrong", "unknown arm 'wrong'"),
+    "700, 0, 0, 0, 10]": ("700]", "x, y, z in mm"),
+    'right_A.csv", chain = "right"': ('left_A.csv", chain = "left"', "defined twice"),
+}
+
+
+@pytest.mark.parametrize("line", REFUSED)
+def test_manifests_are_refused_in_one_sentence(two_arms, line):
+    path, _ = two_arms
+    other, words = REFUSED[line]
+    path.write_text(MANIFEST.replace(line, other, 1))
+    with pytest.raises(aj.InputError, match=words) as error:
+        aj.files.read_manifest(path)
+    assert "\n" not in str(error.value)
+
+
+LOOPED = ROBOT.replace('<parent link="base"/>', '<parent link="left_tool"/>')
+BAD = {
+    "cyclic": (LOOPED, {"base": "trunk"}, "loop"),
+    "no such tip": (ROBOT, {"tip": ["left_tool", "hand"]}, "no link 'hand'"),
+    "mimics what is not in a chain": (ROBOT.replace('joint="right3"', 'joint="none"'), {}, "mimics 'none'"),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_bad_files_are_refused_in_one_sentence(tmp_path, what):
+    text, options, words = BAD[what]
+    (tmp_path / "bad.urdf").write_text(text)
+    with pytest.raises(aj.InputError, match=words) as error:
+        aj.load_arm(tmp_path / "bad.urdf", **options)
+    assert "\n" not in str(error.value)
