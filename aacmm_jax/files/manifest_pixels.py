@@ -1,5 +1,6 @@
 """[[pixels]] of a manifest: images of a target, or tables of corners, with the readings of their poses."""
 
+import base64
 import glob
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -18,7 +19,7 @@ from ..data.observations.pixels import Pixels
 from ..data.recording import ReadImage
 from ..data.targets import AbstractTarget, target_of
 from .camera_files import read_camera
-from .corner_tables import NO_CORNERS, Seen, corners_of_json, corners_of_table, matched, natural_order
+from .corner_files import NO_CORNERS, Seen, corners_of_json, corners_of_table, matched, natural_order
 from .manifest_cameras import CameraTable, PixelsTable, TargetTable
 from .manifest_files import as_list
 from .manifest_readings import checked_unit
@@ -40,6 +41,7 @@ class Detecting(NamedTuple):
 
     progress: Progress = without_progress
     overlays: Path | None = None  # folder of a picture for each image, with the corners that were found in it
+    found: dict[Any, list[Seen]] | None = None  # in images that were read before, by where they are and what is in them
 
 
 class _Poses(Declared):
@@ -168,7 +170,7 @@ def observations_of(
                 for i in matched([image.label for image in seen], wanted, len(q))
             ]
             named = "/".join(filter(None, (part.session, name)))
-            read += [ReadImage(named, image.label, len(image.ids), image.refused) for image in images]
+            read += [_read(named, image, image.refused) for image in images]
             used = [i for i, image in enumerate(images) if not image.refused]
             _check_once(q, images, used)
             if not used:
@@ -177,7 +179,11 @@ def observations_of(
             observed.append((part.session, _pixels(name, entry, camera, target, q[used], [images[i] for i in used])))
     named_images = {image.image for image in read}
     others = [image for image in seen if image.label not in named_images]
-    return observed, [*read, *(ReadImage(name, x.label, len(x.ids), "no row of the readings names it") for x in others)]
+    return observed, [*read, *(_read(name, image, "no row of the readings names it") for image in others)]
+
+
+def _read(observation: str, image: Seen, refused: str) -> ReadImage:
+    return ReadImage(observation, image.label, len(image.ids), refused, image.preview)
 
 
 def _seen(
@@ -192,24 +198,35 @@ def _seen(
         named = as_list(entry.corner_table or (entry.table if file in entry.paths else None) or [])
         text = source.table(file, decimal=None, tables=named, corners=dimension)
         return corners_of_table(text, dimension, entry.corner_columns)
-    from ..camera.detection import detect, overlay
-
     pattern = fill(str(entry.images), values)
+    size = None if camera.image_size is None else tuple(int(number) for number in camera.image_size)
+    found, key = {} if detecting.found is None else detecting.found, (pattern, fill(entry.target, values), size)
+    if key not in found:
+        found[key] = _detected(source, pattern, target, size, detecting)
+    return found[key]
+
+
+def _detected(
+    source: Source, pattern: str, target: AbstractTarget, size: tuple[int, ...] | None, detecting: Detecting
+) -> list[Seen]:
+    """The corners that images show."""
+    from ..camera.detection import detect, overlay, preview, read_image
+
     paths = [Path(path) for path in glob.glob(str(Path(glob.escape(str(source.folder))) / pattern), recursive=True)]
     names = natural_order([path.relative_to(source.folder).as_posix() for path in paths if path.is_file()])
     if not names:
         raise InputError(f"no image matches '{pattern}' in {source.folder}; check the path.")
-    size = None if camera.image_size is None else tuple(int(number) for number in camera.image_size)
     seen = []
     for name in detecting.progress(names, "Detecting corners"):
-        image = source.open(name)
+        image = read_image(source.open(name))
         found = detect(image, target, image_size=size)
         if detecting.overlays is not None:
             detecting.overlays.mkdir(parents=True, exist_ok=True)
             # Images of several folders may have the same name.
             with write_atomically(detecting.overlays / f"{name.replace('/', '_')}.jpg") as path:
                 path.write_bytes(overlay(image, found))
-        seen.append(Seen(name, found.ids, found.corners, found.refused, found.size))
+        small = base64.b64encode(preview(image)).decode()
+        seen.append(Seen(name, found.ids, found.corners, found.refused, found.size, small))
     return seen
 
 

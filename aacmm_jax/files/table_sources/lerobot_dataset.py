@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import pyarrow
-import pyarrow.parquet
 
 from ...core.errors import InputError
 from ...core.text import quoted, shorten
@@ -23,6 +21,8 @@ def read(members: Mapping[str, bytes], tables: Sequence[str], corners: int) -> d
 
     ``tables``: the feature that is read, by default what was measured.
     """
+    from pyarrow.parquet import ParquetFile
+
     info = next((json.loads(content) for name, content in members.items() if name.endswith("info.json")), {})
     names = [name for name in members if name.endswith(".parquet")]
     data = [name for name in names if name.replace("\\", "/").startswith("data/")] or names
@@ -30,7 +30,7 @@ def read(members: Mapping[str, bytes], tables: Sequence[str], corners: int) -> d
     header: list[str] = []
     rows: list[list[Any]] = []
     for name in data:
-        file = pyarrow.parquet.ParquetFile(io.BytesIO(members[name]))
+        file = ParquetFile(io.BytesIO(members[name]))
         features = file.schema_arrow.names
         missing = [feature for feature in wanted if feature not in features]
         if missing:

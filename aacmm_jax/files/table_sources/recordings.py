@@ -14,20 +14,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from rosbags.interfaces import MessageDefinitionFormat
-from rosbags.rosbag1 import Reader as Reader1
-from rosbags.rosbag2 import Reader as Reader2
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ...core.errors import InputError
 from ...core.text import pluralise, quoted, shorten
 from .nested import table_text
 from .standstills import standstills
-
-if sys.version_info >= (3, 14):
-    from compression import zstd
-else:
-    from backports import zstd  # of rosbags
 
 _JOINTS = "sensor_msgs/msg/JointState"
 _TREE = "tf2_msgs/msg/TFMessage"
@@ -99,6 +90,10 @@ def read(members: Mapping[str, bytes], tables: Sequence[str], corners: int) -> d
 
 def _messages(name: str, content: bytes, seen: dict[str, str]) -> Iterator[tuple[str, str, float, Any]]:
     """Topic, type, time of recording and content of the messages that are read; ``seen`` collects all topics."""
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2 import Reader as Reader2
+    from rosbags.typesys import Stores, get_typestore
+
     if name.endswith(".zstd"):
         name, content = name.removesuffix(".zstd"), _unpacked(content)
     ros1 = name.lower().endswith(".bag")
@@ -119,6 +114,11 @@ def _messages(name: str, content: bytes, seen: dict[str, str]) -> Iterator[tuple
 
 
 def _unpacked(content: bytes) -> bytes:
+    if sys.version_info >= (3, 14):
+        from compression import zstd
+    else:
+        from backports import zstd  # of rosbags
+
     with zstd.open(io.BytesIO(content), "rb") as stream:
         unpacked = stream.read(_LARGEST_UNPACKED + 1)
     if len(unpacked) > _LARGEST_UNPACKED:
@@ -131,6 +131,9 @@ def _register(store: Any, connection: Any) -> None:
 
     Python code is made of it, so that names in it must be names, and known types stay as they are.
     """
+    from rosbags.interfaces import MessageDefinitionFormat
+    from rosbags.typesys import get_types_from_msg
+
     definition = connection.msgdef
     if definition.format != MessageDefinitionFormat.MSG:
         raise InputError(

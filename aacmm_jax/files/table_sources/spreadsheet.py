@@ -7,8 +7,6 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import openpyxl
-
 from ...core.errors import InputError
 from ...core.text import quoted, shorten
 from .nested import table_text
@@ -20,6 +18,8 @@ _MOST_ROWS = 1_048_576  # of a sheet
 
 def read(members: Mapping[str, bytes], tables: Sequence[str], corners: int) -> dict[str, Any]:
     """The lines of a sheet, its empty ones included, so that they are numbered as in the sheet."""
+    import openpyxl
+
     (content,) = members.values()
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         if sum(entry.file_size for entry in archive.infolist()) > _LARGEST_UNPACKED:

@@ -6,7 +6,6 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.files.table_sources import recordings
-from aacmm_jax.files.table_sources.recordings import zstd
 from aacmm_jax.files.text_table import TextTable
 from tests.files.table_sources.damage import refused_when_damaged
 from tests.files.table_sources.ros_recordings import CALIBRATION, KINDS, TAGS, Recorder, record
@@ -254,6 +253,7 @@ def test_a_definition_in_a_recording_cannot_run_code(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_compressed_recordings(tmp_path, kind):
+    zstd = pytest.importorskip("backports.zstd")  # of rosbags, before Python 3.14
     path, _ = record(tmp_path, kind, "ur10e", POSES[:3])
     for file in [path] if kind == "rosbag1" else list(path.glob("session.*")):
         packed = file.with_name(f"{file.name}.zstd")

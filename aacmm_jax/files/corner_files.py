@@ -42,6 +42,7 @@ class Seen(NamedTuple):
     corners: Float[np.ndarray, "k d"]
     refused: str = ""  # why it is not used
     size: tuple[int, int] | None = None  # width, height, px
+    preview: str | None = None  # small picture (JPEG, base64)
 
 
 def corners_of_table(text: TextTable, dimensions: int, columns: Mapping[Any, Picked]) -> list[Seen]:
@@ -78,8 +79,9 @@ def corners_of_table(text: TextTable, dimensions: int, columns: Mapping[Any, Pic
 def corners_of_json(file: InputFile, target: AbstractTarget, dimensions: int) -> list[Seen]:
     """The corners of each image in JSON with a list for each image; arguments as of `corners_of_table`, and the target
     that was seen."""
+    text = file.text
     try:
-        content: Any = json.loads(file.text)
+        content: Any = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{file} is not valid JSON ({error}); correct the file.") from error
     content = (
