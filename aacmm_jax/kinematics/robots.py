@@ -287,7 +287,8 @@ def base_derivatives(robot: Arm, chain: ChainOf, names: Sequence[str]) -> Float[
     """How the base of a chain moves with parameters of the robot: its position, and a small rotation about the axes of
     the robot's base; mm and rad."""
     derivatives = np.zeros((6, len(names)))
-    for place in np.flatnonzero(np.isin(names, mount_names(chain))):
+    own = mount_names(chain)
+    for place in (place for place, name in enumerate(names) if name in own):
         ends = []
         for step in (_STEP, -_STEP):
             moved = robot.replace(**{names[place]: value_of(robot, names[place]) + step})
