@@ -132,7 +132,7 @@ def two_arms(tmp_path: Path) -> tuple[Path, np.ndarray]:
 def test_bases_are_found_from_what_two_arms_touched(two_arms):
     path, base = two_arms
     recording = aj.files.read_manifest(path)
-    assert recording.capture.sizes == (16, 16, 16)
+    assert recording.capture.sizes == (8, 8, 8)
     np.testing.assert_allclose(aj.kinematics.chain_of(recording.nominal.arm, "right").base, base, atol=1e-6)
 
 
