@@ -56,7 +56,7 @@ def arm(
         "Model of non-geometric joint errors, as for calibrate --model; for example gravity,harmonics=1.", "MODEL"
     ),
     base: str | None = options.BASE_LINK,
-    tip: str | None = options.TIP_LINK,
+    tip: list[str] | None = options.TIP_LINK,
     probe: str | None = option(
         "Position (mm) of the tool tip in the frame of the last link, for a URDF, MJCF or kinematics.yaml.", "X,Y,Z"
     ),

@@ -88,7 +88,7 @@ def simulate(
         "of poses in sockets; the artefacts have u = 0.001 mm."
     ),
     base: str | None = options.BASE_LINK,
-    tip: str | None = options.TIP_LINK,
+    tip: list[str] | None = options.TIP_LINK,
     seed: int = seed("poses and noise"),
     as_json: bool = options.JSON,
 ) -> None:

@@ -53,7 +53,10 @@ NOMINAL_ARM = argument(
 ABOUT = option("Administrative data of a certificate: laboratory, customer, item, persons, dates.", "FILE.toml")
 BASE_LINK = option("Fixed base link of the arm, of a URDF or MJCF. Default: the root (MJCF: world).", "LINK", "--base")
 TIP_LINK = option(
-    "Last link (MJCF: body or site) of the arm. Default: the only link or body without a child.", "LINK", "--tip"
+    "Last link (MJCF: body or site) of the arm; repeat for a robot of several chains. Default: all links or bodies "
+    "without a child, one for each chain of joints.",
+    "LINK",
+    "--tip",
 )
 _ENCODER = "the standard deviation of a joint reading"
 _SEATING = "the standard deviation of the tip in its socket, for each coordinate"

@@ -158,7 +158,7 @@ def plan(
         "Write a manifest to this file; aacmm import reads the recorded readings with it.", "FILE.toml"
     ),
     base: str | None = options.BASE_LINK,
-    tip: str | None = options.TIP_LINK,
+    tip: list[str] | None = options.TIP_LINK,
     seed: int = seed("the random choices"),
     as_json: bool = options.JSON,
 ) -> None:

@@ -191,7 +191,7 @@ def show(
     cell: int | None = option("Show all results of this cell of a study.", "N", min=1),
     figures: Path | None = option("Write the figures of a study (PNG) to this folder.", "FOLDER"),
     base: str | None = options.BASE_LINK,
-    tip: str | None = options.TIP_LINK,
+    tip: list[str] | None = options.TIP_LINK,
     as_json: bool = options.JSON,
 ) -> None:
     """Print the content of a file."""

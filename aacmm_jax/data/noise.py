@@ -16,7 +16,7 @@ from ..core.arrays import Numbers, is_concrete
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known, to_jax, to_numpy
 from ..core.units import ARCSEC
-from ..kinematics.arm import Arm, joint_limits
+from ..kinematics.arm import Arm, joint_limits, with_chains
 from ..kinematics.chain import Geometry, JointKinds, JointMotion, forward_pass, joint_motion
 from ..kinematics.jacobian import reading_columns
 
@@ -226,7 +226,7 @@ def noise_of_repeatability(arm: Arm, repeatability: float, seating: float = SEAT
     if not (math.isfinite(repeatability) and repeatability > 0):
         raise InputError(f"the repeatability is {repeatability:g} mm; give a positive number.")
     limits = np.asarray(joint_limits(arm, None))
-    q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_SAMPLES, arm.joints))
+    q = with_chains(arm, np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_SAMPLES, arm.joints)))
     geometry = to_numpy(arm.geometry)
     unit = noise_of(np.asarray(1.0), np.asarray(0.0)).of_readings(geometry.kinds)
     scattered = np.asarray(encoder_covariances(geometry, joint_motion(geometry, q), unit))

@@ -9,6 +9,7 @@ import contextlib
 import math
 import os
 import re
+from collections.abc import Sequence
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -78,7 +79,7 @@ def load_cell(
     file: str | os.PathLike | None = None,
     *,
     base: str | None = None,
-    tip: str | None = None,
+    tip: str | Sequence[str] | None = None,
     radius: float | None = None,
 ) -> LoadedCell:
     """What an arm may not touch: obstacles of a TOML file, and itself.

@@ -30,6 +30,7 @@ from ..kinematics.arm import (
     by_joint,
     correction_names,
     natural_steps,
+    one_chain,
     parameter_unit,
     value_of,
     with_arrays,
@@ -135,7 +136,7 @@ def zero_offsets(nominal: Arm, calibrated: Arm, q: Float[np.ndarray, "N n"]) -> 
         >>> print(f"{zeros.rms_nominal:.2f} mm without offsets, {zeros.rms:.2f} mm with them")
         1.92 mm without offsets, 1.48 mm with them
     """
-    nominal, calibrated = single(nominal), single(calibrated)
+    nominal, calibrated = (one_chain(single(arm), "a table of joint zero offsets") for arm in (nominal, calibrated))
     if nominal.joints != calibrated.joints:
         raise InputError(
             f"the arms have {nominal.joints} and {calibrated.joints} joints; give two arms with the same number of "

@@ -104,6 +104,9 @@ def urdf_chain(source: UrdfSource, *, alone: bool = True) -> UrdfChain:
         [750.   0. 300.] mm
     """
     robot = parse_robot(source.text)
+    if len(source.tips) > 1:
+        tips = listed_links(source.tips)
+        raise InputError(f"the file has several chains, which end at {tips}; choose one tip (tip= or --tip).")
     path = joints_between(robot, source.base, source.tip)
     joints, before, frames, frame, fixed = [], [], [], np.eye(4), np.eye(4)
     for joint in path:

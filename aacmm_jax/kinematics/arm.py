@@ -351,6 +351,17 @@ def _tips_annotation(tips: int) -> Any:
     return Float[Array, f"... {3 * tips}"]
 
 
+def one_chain(arm: Arm, what: str) -> Arm:
+    """The same arm; raises `InputError` for a robot of several chains, where ``what`` is for a single one."""
+    if arm.chains:
+        names = ", ".join(f"'{name}'" for name, _ in arm.chains)
+        raise InputError(
+            f"{what} is for a single chain, but the robot has the chains {names}; choose one (tip= or --tip of a URDF, "
+            "or kinematics.chain_of)."
+        )
+    return arm
+
+
 def tips_of(arm: Arm) -> int:
     """Number of tips: one, or one of each chain of a robot."""
     return max(1, len(arm.chains))

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import InputError
-from .arm import NEARLY_PARALLEL, Arm, arm_of
+from .arm import NEARLY_PARALLEL, Arm, arm_of, one_chain
 from .chain import Geometry
 
 Vector = Float[np.ndarray, " 3"]
@@ -90,6 +90,7 @@ def tip_frame(geometry: Geometry, base: Transform) -> Transform:
 
 def geometry_of(arm: Arm) -> Geometry:
     """The parameters of an arm as NumPy arrays, or `InputError` for joint corrections: for formats without these."""
+    one_chain(arm, "this format")
     if arm.corrections is not None:
         raise InputError(
             "the arm has joint corrections, which this format cannot store; write TOML, write only the joint zero "

@@ -112,7 +112,7 @@ class Beside:
         """Random values of all columns after those of the joints, for questions that no recording answers; chains take
         turns."""
         widths = {name: self.width([name]) - self.own for name in self.possible}
-        chain = np.arange(count)[:, None] % max(self.chains, 1)
+        chain = np.arange(float(count))[:, None] % max(self.chains, 1)
         drawn = [random.uniform(*_RANGES[name], (count, width)) for name, width in widths.items()]
         return np.hstack([chain[:, : self.own - self.joints], *drawn])
 

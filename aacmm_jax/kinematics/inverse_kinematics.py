@@ -277,7 +277,7 @@ def corrected_readings(nominal: Arm, calibrated: Arm, q: Numbers, limits: Limits
             f"the arms have {nominal.joints} and {calibrated.joints} joints; give arms with the same number of joints."
         )
     q = as_array(q, "q", like=calibrated.alpha)
-    wanted = nominal.pose(q[..., : nominal.joints])
+    wanted = nominal.pose(q[..., : nominal.beside.own])
     return readings_at_poses(calibrated, q, wanted, nominal.limits if limits is None else limits)
 
 

@@ -11,7 +11,7 @@ from ..core.arguments import Count, Range, checked_fields
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..data.noise import CLASSES, ArmNoise, Noise, small_arm_noise
-from ..kinematics.arm import Arm, is_single, jacobian_at, joint_limits
+from ..kinematics.arm import Arm, is_single, jacobian_at, joint_limits, one_chain
 from ..kinematics.chain import reading_units
 from ..kinematics.collisions import Cell, HalfSpace
 from ..kinematics.corrected_arm import loads_of
@@ -141,7 +141,7 @@ class DesignProblem(NamedTuple):
         """
         if not is_single(arm):
             raise InputError("a plan needs a single arm, but this is a batch; select one arm of the batch.")
-        options = checked_fields(options)
+        options, arm = checked_fields(options), one_chain(arm, "a plan")
         space = Parameters.free_of(arm) if options.space is None else options.space
         # Plans are at 20 C, so they say nothing of thermal expansion, and without masses their torques are unknown.
         kinds = (Expansion,) if arm.corrections is None or loads_of(arm) else (Expansion, Torque)

@@ -9,7 +9,7 @@ from ..core.numpy_or_jax import to_numpy
 from ..core.text import pluralise, shorten
 from ..core.units import ARCSEC
 from ..data.noise import ArmNoise
-from ..kinematics.arm import Arm, correction_names, joint_limits, without_corrections
+from ..kinematics.arm import Arm, correction_names, joint_limits, one_chain, without_corrections
 from ..kinematics.axes_to_dh import Transform, dh_frames, geometry_of, tip_frame
 from ..kinematics.corrected_arm import function_values, loads_of
 from ..kinematics.corrections import terms_of
@@ -37,7 +37,7 @@ def arm_survey(
     ``base``: the first frame in a robot's base link, mm; frames are in the base link then. ``model``: that the arm's
     corrections are of, where one was named.
     """
-    arm: Arm = to_numpy(specification.arm)
+    arm: Arm = to_numpy(one_chain(specification.arm, "this survey"))
     plain_arm, links = without_corrections(arm), total_link_length(arm)
     reach = arm_reach(plain_arm)
     base = np.eye(4) if base is None else base
