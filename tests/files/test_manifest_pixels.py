@@ -196,11 +196,11 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "webcam"
 
 def part_of_example(folder, count):
     """The first images of the rendered example, with their readings, which are returned, and its manifest."""
-    (folder / "images").mkdir()
-    for image in sorted((EXAMPLE / "images").iterdir())[:count]:
-        shutil.copy(image, folder / "images")
-    rows = (EXAMPLE / "joints.csv").read_text().splitlines()[: count + 1]
-    (folder / "joints.csv").write_text("\n".join(rows) + "\n")
+    (folder / "webcam").mkdir()
+    for image in sorted((EXAMPLE / "webcam").iterdir())[:count]:
+        shutil.copy(image, folder / "webcam")
+    rows = (EXAMPLE / "webcam.csv").read_text().splitlines()[: count + 1]
+    (folder / "webcam.csv").write_text("\n".join(rows) + "\n")
     shutil.copy(EXAMPLE / "webcam.toml", folder)
     return rows
 
@@ -209,10 +209,11 @@ def test_corners_are_detected_once_where_readings_are_commanded_and_measured(tmp
     """The manifest is read again with the other readings."""
     pytest.importorskip("cv2")
     head, *rows = part_of_example(tmp_path, 4)
-    both = [",".join(f"{name.split()[0]}_{role} [deg]" for name in head.split(",")[1:]) for role in ("cmd", "meas")]
+    names = head.split(",")[1:]
+    both = [",".join(name.replace("_deg", f"_{role}_deg") for name in names) for role in ("cmd", "meas")]
     twice = [f"{row},{','.join(str(float(number) + 0.1) for number in row.split(',')[1:])}" for row in rows]
-    (tmp_path / "joints.csv").write_text("\n".join([f"image,{both[0]},{both[1]}", *twice]) + "\n")
-    text = (tmp_path / "webcam.toml").read_text() + 'columns = { q = ["J*_meas*"] }\n'
+    (tmp_path / "webcam.csv").write_text("\n".join([f"image,{both[0]},{both[1]}", *twice]) + "\n")
+    text = (tmp_path / "webcam.toml").read_text() + 'columns = { q = ["q_*_meas_deg"] }\n'
     (tmp_path / "webcam.toml").write_text(text)
     detected, detect = [], detection.detect
     monkeypatch.setattr(detection, "detect", lambda *given, **named: detected.append(1) or detect(*given, **named))
@@ -224,7 +225,7 @@ def test_corners_are_detected_once_where_readings_are_commanded_and_measured(tmp
 def test_images_are_read_and_drawn(tmp_path):
     cv2 = pytest.importorskip("cv2")
     rows = part_of_example(tmp_path, 5)
-    cv2.imwrite(str(tmp_path / "images" / "05.jpg"), np.full((480, 640), 128, dtype=np.uint8))  # nothing in it
+    cv2.imwrite(str(tmp_path / "webcam" / "05.jpg"), np.full((480, 640), 128, dtype=np.uint8))  # nothing in it
     shown = []
 
     def progress(items, what):
@@ -236,7 +237,7 @@ def test_images_are_read_and_drawn(tmp_path):
     assert shown == [(5, "Detecting corners")]
     assert [image.corners > 0 for image in recording.images] == [True] * 4 + [False]
     assert recording.images[4].refused
-    assert recording.capture.observations[0].images == tuple(f"images/{row[:6]}" for row in rows[1:5])
+    assert recording.capture.observations[0].images == tuple(f"webcam/{row[:6]}" for row in rows[1:5])
     assert len([cv2.imread(str(path)).shape for path in overlays.iterdir()]) == 5
     for image in recording.images:  # those refused too
         small = cv2.imdecode(np.frombuffer(base64.b64decode(image.preview), np.uint8), cv2.IMREAD_UNCHANGED)
