@@ -14,6 +14,7 @@ from ..data.capture_data import UNKNOWN, Repeated
 from ..data.noise import ArmNoise
 from ..data.observations.declared import Entry
 from ..data.observations.observation import AbstractObservation
+from ..data.observations.pixels import Pixels
 from ..data.observations.simulated import kinds
 from ..data.recording import ProbedSphere, ReadImage, Recording, checked_sphere
 from ..kinematics.arm import Arm, correction_names, readings_unit
@@ -26,6 +27,7 @@ from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, un
 from .records import Field, attribute_name, record_in, row_values, rows_in, rows_table, table_of, values_in
 from .schema import ARM, IMAGES, LENGTHS, RECORDING, SPHERES, USUAL_NOISE
 from .stored_checks import read_checked
+from .urdf import located, urdf_chain
 
 _OBSERVATION = "observation_"
 
@@ -148,7 +150,11 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     table = stored.tables.get("urdf")
     if table is not None:
         text = "".join(map(str, table["text"]))
-        nominal = nominal._replace(urdf=UrdfSource(text, table.attributes["base"], table.attributes["tip"]))
+        source = UrdfSource(text, table.attributes["base"], table.attributes["tip"])
+        if any(isinstance(each, Pixels) for each in capture.observations):  # whose mounts are given in the links
+            with naming(path):
+                source = located(source, urdf_chain(source), nominal.arm)
+        nominal = nominal._replace(urdf=source)
     return Recording(
         capture,
         nominal,
