@@ -10,6 +10,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.camera import detection
+from aacmm_jax.data.cameras.camera import camera_models
 from tests.refusals import assert_refused
 
 TARGET = '[[target]]\nname = "board"\nkind = "charuco"\nsquares = [6, 5]\nsize = 30.0\nmarker = 22.0\n'
@@ -170,6 +171,51 @@ def test_tables_that_make_no_sense_are_refused(tmp_path, seen, table, old, new, 
     assert old in text
     (tmp_path / table).write_text(text.replace(old, new, 1))
     assert_refused(lambda: read(tmp_path), *parts)
+
+
+def line(image, i, u, v):
+    return f"{image},{i},{u},{v}"
+
+
+KNOWN = TARGET + CAMERA + 'intrinsics = { fx = 600, fy = 610, cx = 319.5, cy = 239.5 }\nu = "exact"\n' + PIXELS
+LARGER = KNOWN.replace("319.5", "959.5").replace("239.5", "539.5").replace("[640, 480]", "[1920, 1080]")
+FEW, ON_A_LINE, BEHIND = "only 3 corners", "its 5 corners are on one line", "the board is seen from behind"
+
+
+@pytest.mark.parametrize(
+    ("change", "text", "parts"),
+    [
+        (lambda *row: line(*row) if row[1] < 3 else "", KNOWN, [FEW, "'img_0.png' and 11 more"]),
+        (lambda *row: line(*row) if row[1] < 5 else "", KNOWN, [ON_A_LINE, "'img_0.png' and 11 more"]),
+        (lambda image, i, u, v: line(image, i, 639 - u, v), KNOWN, [BEHIND, "'img_0.png' and 11 more"]),
+        (line, LARGER.replace("600", "1800").replace("610", "1830"), ["others (fx = 60", "another image size"]),
+    ],
+    ids=["few corners", "on one line", "mirrored", "intrinsics of another image size"],
+)
+def test_corners_that_show_no_view_are_refused(tmp_path, seen, change, text, parts):
+    files(tmp_path, seen)
+    head, *rows = (tmp_path / "corners.csv").read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    changed = [change(image, int(i), float(u), float(v)) for image, i, u, v in cells]
+    (tmp_path / "corners.csv").write_text("\n".join([head, *filter(None, changed)]) + "\n")
+    assert_refused(lambda: read(tmp_path, text), *parts)
+
+
+def test_images_of_another_size_than_the_intrinsics_are_refused(tmp_path):
+    pytest.importorskip("cv2")
+    part_of_example(tmp_path, 2)
+    text = (tmp_path / "webcam.toml").read_text()
+    (tmp_path / "webcam.toml").write_text(text.replace("[640, 480]", "[1280, 720]"))
+    said = "it has 640 x 480 px, but the intrinsics of the camera are for 1280 x 720 px"
+    assert_refused(lambda: aj.files.read_manifest(tmp_path / "webcam.toml"), said, "'webcam/01.jpg' and 1 more")
+
+
+@pytest.mark.parametrize("model", ["pinhole", "fisheye"])
+def test_points_behind_a_camera_are_not_seen(model):
+    """In space, where no image shows them; at the edge, the distortion folds."""
+    camera, lens = camera_models()[model], np.array([600.0, 610, 320, 240, -0.3, 0, 0, 0])
+    points = np.array([[0.0, 0, 500], [10, 20, -500], [2000, 0, 400 if model == "pinhole" else -1]]).T
+    assert camera.folded(points, lens).tolist() == [False, True, True]
 
 
 def test_two_images_of_one_pose_are_refused(tmp_path, seen):

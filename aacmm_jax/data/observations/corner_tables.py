@@ -15,6 +15,7 @@ from .pixels import Pixels
 
 _FAR = 5.0  # robust standard deviations, beyond which a corner takes no part in a start
 _LEAST_U = 1e-3  # px
+_MISFIT, _BETTER = 1.0, 3.0  # px RMS that stated intrinsics leave, if others leave less by this factor: a mistake
 
 
 class Camera(NamedTuple):
@@ -180,9 +181,7 @@ def _started(seen: Corners, camera: Camera) -> tuple[np.ndarray, np.ndarray, Cam
         default = {"pinhole": 5}.get(camera.model, seen.model.counts[-1] - 4)
         count = 4 + (default if camera.coefficients is None else camera.coefficients)
         seen.model.check_count(count, where)
-        largest = seen.values[seen.present].max(axis=0) + 1
-        size = np.asarray(largest if size is None else size, dtype=float)
-        stated, u = started_intrinsics(seen, count, size), np.full(count, np.inf)
+        stated, u = started_intrinsics(seen, count, _size_of(seen, size)), np.full(count, np.inf)
     # A free number has a wide prior here, so that images which do not show it give a start nearby.
     sizes = [0.5 * stated[:2].mean(), 0.2 * stated[2:4].mean()] if len(stated) else []
     wide = np.concatenate([np.repeat(sizes, 2), np.ones(max(len(stated) - 4, 0))])
@@ -191,4 +190,17 @@ def _started(seen: Corners, camera: Camera) -> tuple[np.ndarray, np.ndarray, Cam
     near = ~(alone.far(seen) > _FAR)
     if not near.all():
         alone = calibrated_camera(seen._replace(present=seen.present & near), alone.intrinsics, u > 0, prior)
+    if len(stated) and np.all(np.isfinite(u)) and alone.rms > _MISFIT:
+        free = calibrated_camera(seen, started_intrinsics(seen, len(stated), _size_of(seen, size)), prior=wide)
+        if free.rms < alone.rms / _BETTER:
+            raise InputError(
+                f"the stated intrinsics of {where} leave residuals of {alone.rms:.2g} px RMS, and others (fx = "
+                f"{free.intrinsics[0]:.0f}, fy = {free.intrinsics[1]:.0f} px) leave {free.rms:.2g} px; they may be "
+                "those of another image size or camera: correct them, or state that they are free."
+            )
     return np.where(np.isfinite(u), stated, alone.intrinsics), u, alone
+
+
+def _size_of(seen: Corners, stated: Sequence[float] | None) -> Float[np.ndarray, "2"]:
+    """Width and height of the images, px; at least what the corners need."""
+    return np.asarray(seen.values[seen.present].max(axis=0) + 1 if stated is None else stated, dtype=float)
