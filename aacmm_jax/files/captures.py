@@ -14,7 +14,6 @@ from ..data.capture_data import UNKNOWN, Repeated
 from ..data.noise import ArmNoise
 from ..data.observations.declared import Entry
 from ..data.observations.observation import AbstractObservation
-from ..data.observations.pixels import Pixels
 from ..data.observations.simulated import kinds
 from ..data.recording import ProbedSphere, ReadImage, Recording, checked_sphere
 from ..kinematics.arm import Arm, correction_names, readings_unit
@@ -151,10 +150,8 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     if table is not None:
         text = "".join(map(str, table["text"]))
         source = UrdfSource(text, table.attributes["base"], table.attributes["tip"])
-        if any(isinstance(each, Pixels) for each in capture.observations):  # whose mounts are given in the links
-            with naming(path):
-                source = located(source, urdf_chain(source), nominal.arm)
-        nominal = nominal._replace(urdf=source)
+        with naming(path):
+            nominal = nominal._replace(urdf=located(source, urdf_chain(source), nominal.arm))
     return Recording(
         capture,
         nominal,
