@@ -16,12 +16,11 @@ from ..data.observations.pixels import Pixels
 from ..data.recording import Recording
 from ..diagnostics.reprojection import frame_of
 from ..kinematics.arm import by_joint
-from ..kinematics.chain import beside_joints
 from .kits import kit_targets, target_tables
 from .manifest_pixels import Progress, without_progress
 from .outputs import write_atomically, write_text
 from .plans import camera_tables, images_table, manifest_text
-from .table_columns import TEMPERATURE, TORQUE
+from .table_columns import BESIDE
 
 MANIFEST = "capture.toml"
 _QUALITY = 80  # of JPEG
@@ -99,10 +98,9 @@ def _rendered(observation: Pixels, pose: int, target: Any, optics: Any, seed: in
 def _readings(recording: Recording, observation: Pixels, names: Sequence[str]) -> list[list[Any]]:
     """A table with the name of an image and the readings of its pose in each row."""
     arm, q = recording.nominal.arm, np.asarray(observation.q)
-    torques, temperature = beside_joints(arm.joints, q.shape[1])
     head = [f"q_{i}_{unit}" for i, unit in enumerate(by_joint(arm, "deg", "mm"), start=1)]
-    head += [TORQUE.format(i) for i in range(1, 1 + torques.stop - torques.start)]
-    head += [TEMPERATURE] * (temperature.start < q.shape[1])
+    for name in arm.beside.names(q.shape[1]):
+        head += [BESIDE[name].format(i) for i in range(1, 1 + arm.beside.width([name]) - arm.joints)]
     scale = np.ones(q.shape[1])
     scale[: arm.joints] = by_joint(arm, DEG, 1.0)
     rows = [[name, *(f"{x:.6f}" for x in row)] for name, row in zip(names, (q / scale).tolist(), strict=True)]

@@ -92,6 +92,8 @@ ARM: Fields = {
     "highest": number("highest reading of the joint", "rad", "joint"),
     "prismatic": count("prismatic joints"),
     "torques": truth("whether torques of the joints follow their readings"),
+    "directions": truth("whether directions of approach of the joints follow"),
+    "load": truth("whether a load follows"),
     "thermometer": truth("whether the last column of the readings is the temperature"),
     "prior_groups": text("groups of parameters with a prior"),
     "prior_sd": number("standard deviation of each group with a prior, mm or rad", ""),
