@@ -21,7 +21,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..calibration.scale_anchor import fixes_scale
 from ..calibration.solve import solve
 from ..calibration.task import Solving, task_of
 from ..core.arguments import checked_arguments
@@ -30,19 +29,28 @@ from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.numpy_or_jax import to_numpy
 from ..data.recording import Recording
 from ..diagnostics.equations import LEAST_U, PROBE
-from ..kinematics.arm import Arm, by_joint, joint_limits, without_corrections
+from ..kinematics.arm import (
+    Arm,
+    by_joint,
+    joint_limits,
+    natural_steps,
+    parameter_names,
+    reading_as,
+    without_corrections,
+)
 from ..kinematics.parameters import ArmSpecification, Bounds, Parameters
-from ..kinematics.priors import Prior
 from ..uncertainty.linearisation import Linearisation
-from .single import calibrate, identify
 
 Verdict = Literal["better", "worse", "not decided"]
 LEVEL = 0.05  # of the two-sided test
 _LENGTHS = 1000.0  # mm; half-width of the box of lengths and of the tip
 _TESTED = 300  # poses that stand for the working volume
+_SCALES, _NOISES = np.geomspace(0.02, 50, 40), np.geomspace(1e-3, 5, 40)  # of parameters' errors, and of the noise
+_FACTOR = 1.5  # ln 4.5
 _SAME = 1e-9  # of the residuals: the two arms do not differ in these poses
 _MOST = 1000  # poses that may be asked for
 _RANK = 1e-9
+_TURNED = 3e-3  # of the residuals: so far they follow some steps of 1 mrad, and of 1 mm in 1 m
 _FIXED = ("d_1",)  # a solve has at least one parameter; this one does not change
 _EXACT = 1e-6  # mm: smaller residuals are rounding errors
 _FEWEST = 4  # poses
@@ -141,7 +149,8 @@ def verify(recording: Recording, delivered: ArmSpecification | Arm | None = None
             f"{nominal.joints}; give two descriptions of the same arm."
         )
     recording = to_numpy(recording)
-    arms = [to_numpy(without_corrections(nominal)), to_numpy(_read_alike(arm, nominal))]
+    plain = without_corrections(nominal)
+    arms = [to_numpy(plain), to_numpy(reading_as(without_corrections(arm), plain.recorded))]
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore", IdentifiabilityWarning)
         fits = [_fitted(one, recording.capture) for one in arms]
@@ -158,28 +167,29 @@ def verify(recording: Recording, delivered: ArmSpecification | Arm | None = None
         paired = _paired(*rows)
         linear = [fit.linear for fit in fits]
         # The prior is about the arm that the verdict would be against: few poses cannot decide by it.
-        from_nominal = _Recalibration.of(*arms, *linear, recording.capture)
-        from_delivered = _Recalibration.of(*arms[::-1], *linear[::-1], recording.capture)
-    freedom = max(equations - unknowns - len(Parameters.free_of(arms[0]).names), _FEWEST)
-    wide = float(student_quantile(1 - LEVEL / 2, freedom))
-    everywhere = {
-        "better": from_nominal.share - wide * from_nominal.u > 0.5,
-        "worse": 1 - from_delivered.share + wide * from_delivered.u < 0.5,
-        "not decided": True,
-    }
-    verdict: Verdict = paired.verdict if everywhere[paired.verdict] else "not decided"
+        from_nominal, from_delivered = (
+            _Volume.of(arms[i], arms[1 - i], linear[i], linear[1 - i], sigma) for i in (0, 1)
+        )
+    sure = {"better": from_nominal.probability, "worse": from_delivered.probability, "not decided": 0.0}
+    verdict: Verdict = paired.verdict if sure[paired.verdict] > 1 - LEVEL / 2 else "not decided"
     return Verification(
-        *(verdict, *accuracies),
-        *(paired.share, paired.share - paired.half_width, paired.share + paired.half_width, paired.probability),
-        *(rows[1].poses, equations, unknowns, paired.poses_to_decide(rows[1].poses)),
-        np.array([fit.linear.relations()[1][: len(recording.capture.lengths)] for fit in fits]),
-        *(from_delivered.error, from_delivered.left, paired.verdict, paired.same),
+        verdict=verdict,
+        nominal=accuracies[0],
+        delivered=accuracies[1],
+        share=paired.share,
+        share_lower=paired.share - paired.half_width,
+        share_upper=paired.share + paired.half_width,
+        probability=paired.probability,
+        poses=rows[1].poses,
+        equations=equations,
+        unknowns=unknowns,
+        decided_by=paired.poses_to_decide(rows[1].poses),
+        length_errors=np.array([part.relations()[1][: len(recording.capture.lengths)] for part in linear]),
+        volume=from_delivered.error,
+        recalibrated=from_delivered.left,
+        verdict_here=paired.verdict,
+        same=paired.same,
     )
-
-
-def _read_alike(arm: Arm, nominal: Arm) -> Arm:
-    """The arm without corrections, taking what is recorded beside the joints as the nominal one does."""
-    return without_corrections(arm).replace(torques=nominal.torques, thermometer=nominal.thermometer)
 
 
 def _fitted(arm: Arm, capture: Any) -> "_Fit":
@@ -213,22 +223,39 @@ class _Rows(NamedTuple):
     def of(cls, fit: Linearisation, sigma: float) -> "_Rows":
         """With the weights of this standard deviation of a tip coordinate, mm."""
         linear = Linearisation.at(fit.observed, fit.space, fit.z, sigma=sigma, least=LEAST_U)
-        values, columns, pose, first = [], [], [], 0
-        for white, derivative in zip(linear.white(), linear.dense(), strict=True):
-            rows, poses = white.shape
-            values.append(np.asarray(white).T.ravel())
-            columns.append(np.asarray(derivative).transpose(2, 1, 0).reshape(rows * poses, -1))
-            pose.append(np.repeat(first + np.arange(poses), rows))
-            first += poses
-        derivatives, errors, u = linear.relations()
-        weight = 1 / np.maximum(u, LEAST_U)
-        value = np.concatenate([*values, weight * errors])
-        column = np.concatenate([*columns, weight[:, None] * derivatives]) * linear.steps
-        column = column[:, len(_FIXED) :] if fit.space.names == _FIXED else column
-        basis, sizes, _ = np.linalg.svd(column, full_matrices=False)
-        basis = basis[:, sizes > _RANK * sizes.max(initial=1e-300)]
-        owner = np.concatenate([*pose, first + np.arange(len(errors))])
-        return cls(value - basis @ (basis.T @ value), basis, owner, first)
+        values, columns, owner = _stacked(linear)
+        basis = _basis(columns[:, len(_FIXED) :] if fit.space.names == _FIXED else columns)
+        return cls(_without(basis, values), basis, owner, fit.observed.q.shape[0])
+
+
+def _stacked(linear: Linearisation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All rows in standard deviations, their derivatives, and the pose of each; reference lengths and certified values
+    have numbers of their own."""
+    values, columns, pose, first = [], [], [], 0
+    for white, derivative in zip(linear.white(), linear.dense(), strict=True):
+        rows, poses = white.shape
+        values.append(np.asarray(white).T.ravel())
+        columns.append(np.asarray(derivative).transpose(2, 1, 0).reshape(rows * poses, -1))
+        pose.append(np.repeat(first + np.arange(poses), rows))
+        first += poses
+    derivatives, errors, u = linear.relations()
+    weight = 1 / np.maximum(u, LEAST_U)
+    return (
+        np.concatenate([*values, weight * errors]),
+        np.concatenate([*columns, weight[:, None] * derivatives]),
+        np.concatenate([*pose, first + np.arange(len(errors))]),
+    )
+
+
+def _basis(columns: Float[np.ndarray, "R k"]) -> Float[np.ndarray, "R r"]:
+    """An orthonormal basis of what columns span."""
+    sizes = np.linalg.norm(columns, axis=0)
+    basis, values, _ = np.linalg.svd(columns / np.where(sizes > 0, sizes, 1.0), full_matrices=False)
+    return basis[:, values > _RANK * values.max(initial=1e-300)]
+
+
+def _without(basis: Float[np.ndarray, "R r"], values: Float[np.ndarray, "R ..."]) -> Float[np.ndarray, "R ..."]:
+    return values - basis @ (basis.T @ values)
 
 
 def _accuracy(fit: Linearisation, rows: _Rows) -> Accuracy:
@@ -271,7 +298,7 @@ class _Paired(NamedTuple):
 
 def _paired(nominal: _Rows, delivered: _Rows) -> _Paired:
     basis, first = delivered.basis, nominal.residual
-    first = first - basis @ (basis.T @ first)
+    first = _without(basis, first)
     step = first - delivered.residual
     size = float(step @ step)
     if size <= _SAME**2 * max(float(first @ first), 1e-300):
@@ -294,51 +321,65 @@ def _paired(nominal: _Rows, delivered: _Rows) -> _Paired:
     freedom = max(np.trace(gram) ** 2 / np.sum(gram**2), 1.0)
     half_width = float(student_quantile(1 - LEVEL / 2, freedom)) * u
     ratio = np.array([abs(share - 0.5) / max(u, 1e-300)])
-    probability = 2 * float(student_tail(ratio, np.array([freedom]))[0])
+    probability = float(student_tail(ratio, np.array([freedom]))[0])
     return _Paired(share, u, half_width, probability, False)
 
 
-class _Recalibration(NamedTuple):
-    """A calibration with these poses that begins at one arm, and what follows for the working volume."""
+class _Volume(NamedTuple):
+    """What these poses say of the errors of an arm over the working volume."""
 
-    share: float  # of the step to the other arm that is real there: what holds for poses that were not recorded
-    u: float
-    error: float  # RMS error of the arm over the working volume, mm
-    left: float  # and that of the calibrated arm
+    probability: float  # that more than half of the step to the other arm is real there
+    error: float  # expected RMS error of the arm, mm
+    left: float  # and that of a calibration with these poses
 
     @classmethod
-    def of(cls, arm: Arm, other: Arm, fit: Linearisation, of_other: Linearisation, capture: Any) -> "_Recalibration":
-        """``fit`` and ``of_other`` have the tips of both arms. The prior of a real arm is about ``arm``."""
+    def of(cls, arm: Arm, other: Arm, fit: Linearisation, of_other: Linearisation, sigma: float) -> "_Volume":
+        """``fit`` and ``of_other`` have the tips of both arms; ``sigma`` as for `_Rows`.
+
+        The parameters' errors are s times independent normal numbers of 1 mm and 1 mrad, as those of real arms, and the
+        noise is t times ``sigma``. Both are unknown: the posterior is summed over them, weighted by the evidence, with
+        s expected to be 1 to a factor of 4.5.
+        """
         (arm, tip), (other, _) = _with_tip(arm, fit), _with_tip(other, of_other)
-        names = tuple(dict.fromkeys([*Parameters.free_of(arm).names, *tip]))
-        bounds = Bounds.around(arm, Parameters(arm, names), length=_LENGTHS, angle=math.pi)
-        prior = Prior({"lengths": 1.0, "angles": 1e-3, "probe": math.inf}, learn=("lengths", "angles"))
-        options: dict[str, Any] = {"prior": prior, "replace_noise": False, "hold": None}
-        if fixes_scale(capture):
-            options |= {"shared_errors": False, "undetermined": "ignore", "method": "joint"}
-            result = to_numpy(calibrate(arm, capture, bounds, **options))
-        else:
-            result = to_numpy(identify(arm, capture, bounds, **options))
+        names = tuple(name for name in parameter_names(arm) if not name.startswith(("probe", "beta")))
+        geometry = np.asarray(fit.z)[len(fit.space.names) :]
+        space = Parameters(arm, (*names, *tip))
+        z = np.concatenate([np.asarray(space.vector()), geometry])
+        values, columns, _ = _stacked(Linearisation.at(fit.observed, space, z, sigma=sigma, least=LEAST_U))
+        unknowns, steps = _basis(columns[:, len(names) :]), natural_steps(names)
+        columns = _without(unknowns, columns[:, : len(names)] * steps)
+        values = _without(unknowns, values)
+        left, sizes, right = np.linalg.svd(columns, full_matrices=len(columns) < len(names))
+        # A turn or a scaling of everything moves no row but by turning or scaling its residual, which says nothing.
+        determined = sizes > max(_RANK * sizes[0], _TURNED * np.linalg.norm(values))
+        seen = np.where(determined, left.T @ values, 0.0)
+        unseen = len(values) - unknowns.shape[1] - int(np.sum(determined))
+        sizes, seen = (np.pad(part, (0, len(names) - len(part))) for part in (np.where(determined, sizes, 0), seen))
+        scale, noise = _SCALES[:, None, None], _NOISES[None, :, None]
+        variance = scale**2 * sizes**2 + noise**2
+        evidence = np.sum(np.where(sizes > 0, np.log(variance) + seen**2 / variance, 0.0), axis=2)
+        rest = max(float(values @ values - seen @ seen), 0.0)
+        evidence += (unseen * np.log(noise**2) + rest / noise**2)[..., 0] + (np.log(scale[..., 0]) / _FACTOR) ** 2
+        weight = np.exp(-(evidence - evidence.min()) / 2)
+        weight /= weight.sum()
+        # In the basis of the singular vectors the posterior's covariance is diagonal.
+        mean, spread = -(scale**2) * sizes * seen / variance, scale**2 * noise**2 / variance
         limits = np.asarray(joint_limits(arm, None))
         limits = np.where(np.array(by_joint(arm, True, False))[:, None], np.clip(limits, -math.pi, math.pi), limits)
         q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_TESTED, arm.joints))
-        tips, count = np.asarray(arm.position(q)), 3 * _TESTED
+        tips, turned = np.asarray(arm.position(q)), np.asarray(arm.pose(q))[:, :3, :3]
         moved = np.stack([np.cross(axis, tips) for axis in np.eye(3)], axis=2)
-        turned = np.asarray(arm.pose(q))[:, :3, :3]
-        free = np.concatenate([moved, np.tile(np.eye(3), (_TESTED, 1, 1)), turned], axis=2).reshape(count, -1)
-        free = np.linalg.qr(free)[0]  # the frame of the base, and the tip
-
-        def rest(columns: np.ndarray) -> np.ndarray:
-            return columns - free @ (free.T @ columns)
-
-        step = rest((np.asarray(other.position(q)) - tips).ravel())
-        by_parameters = rest(np.asarray(arm.jacobian(q, names)).reshape(count, -1))
-        change, covariance = np.asarray(result.parameters) - bounds.space.vector(), np.asarray(result.covariance)
-        along = step @ by_parameters / max(float(step @ step), 1e-300)
-        left = float(np.einsum("rp,pq,rq->", by_parameters, covariance, by_parameters)) / _TESTED
-        error = float(np.sum((by_parameters @ change) ** 2)) / _TESTED
-        u = math.sqrt(max(float(along @ covariance @ along), 0.0))
-        return cls(float(along @ change), u, math.sqrt(error + left), math.sqrt(left))
+        free = np.concatenate([moved, np.tile(np.eye(3), (_TESTED, 1, 1)), turned], axis=2)
+        frames = _basis(free.reshape(3 * _TESTED, -1))  # of the base, and the tip
+        step = _without(frames, (np.asarray(other.position(q)) - tips).ravel())
+        by_parameters = _without(frames, np.asarray(arm.jacobian(q, names)).reshape(3 * _TESTED, -1)) * steps @ right.T
+        along, gram = step @ by_parameters / max(step @ step, 1e-300), by_parameters.T @ by_parameters / _TESTED
+        remaining = spread @ np.diag(gram)
+        error = np.einsum("stp,pq,stq->st", mean, gram, mean) + remaining
+        deviation = (mean @ along - 0.5) / np.sqrt(np.maximum(spread @ along**2, 1e-300))
+        half = student_tail(deviation, np.full(weight.shape, np.inf)) / 2
+        probability = float(np.sum(weight * np.where(deviation > 0, 1 - half, half)))
+        return cls(probability, math.sqrt(np.sum(weight * error)), math.sqrt(np.sum(weight * remaining)))
 
 
 def _with_tip(arm: Arm, fit: Linearisation) -> tuple[Arm, tuple[str, ...]]:

@@ -75,7 +75,7 @@ def _verdict(checked: Verification) -> str:
 
 def _poses(checked: Verification) -> str:
     """How many poses decide."""
-    errors = f"(of two equally good sets, {LEVEL / 2:.1%} are called better and {LEVEL / 2:.1%} worse)"
+    errors = f"(of two equally good sets, {50 * LEVEL:g} % are called better and {50 * LEVEL:g} % worse)"
     if checked.same:
         return ""
     if checked.verdict != "not decided":

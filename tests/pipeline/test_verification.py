@@ -6,11 +6,12 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.kinematics.parameters import ArmSpecification
 from aacmm_jax.pipeline.verification import _paired, _Rows
+from aacmm_jax.summaries.verification import verification_summary
 
 PROBE = np.array([20.0, -40.0, 120.0])
 NAMES = tuple(f"{kind}_{i}" for kind in ("a", "d", "theta", "alpha") for i in range(1, 7))
 SIZES = np.repeat([0.5, 1e-3], 12)  # mm and rad
-SOCKETS = {"A": (-400.0, -250.0, 100.0), "B": (-300.0, -250.0, 100.0)}
+SOCKETS = {"A": (-400.0, -250.0, 100.0), "B": (-300.0, -250.0, 100.0), "C": (300.0, 350.0, 400.0)}
 
 
 def arms(seed: int, true: float, other: float):
@@ -22,16 +23,17 @@ def arms(seed: int, true: float, other: float):
     return nominal, space.arm(start + own), space.arm(start + true * own + other * foreign)
 
 
-def recording(nominal, true, poses=8, lengths=()):
+def recording(nominal, true, poses=8, lengths=(), sockets="ABC"):
     noise = aj.Noise(encoder_arcsec=5.0, seating=0.03)
     return aj.Recording(
-        aj.simulate(true, SOCKETS, poses=poses, lengths=lengths, noise=noise, seed=1), ArmSpecification(nominal, "UR5e")
+        aj.simulate(true, {name: SOCKETS[name] for name in sockets}, poses=poses, lengths=lengths, noise=noise, seed=1),
+        ArmSpecification(nominal, "UR5e"),
     )
 
 
 @pytest.mark.parametrize(
     ("true", "other", "verdict"),
-    [(1.0, 0.2, "better"), (1.0, 0.0, "better"), (-1.0, 0.0, "worse"), (0.0, 1.0, "worse"), (0.5, 0.8, "not decided")],
+    [(1.0, 0.2, "better"), (1.0, 0.0, "better"), (-1.0, 0.0, "worse"), (0.0, 2.0, "worse"), (0.5, 0.8, "not decided")],
 )
 def test_verdicts(true, other, verdict):
     nominal, real, delivered = arms(1, true, other)
@@ -43,6 +45,13 @@ def test_verdicts(true, other, verdict):
         assert checked.delivered.rms == pytest.approx(np.sqrt(3) * 0.03, rel=0.3)
         assert checked.share == pytest.approx(1.0, abs=0.05)
         assert checked.volume < 0.3 * checked.nominal.rms
+
+
+def test_poses_in_one_place_do_not_decide_about_the_working_volume():
+    nominal, real, delivered = arms(1, 0.0, 1.0)
+    checked = aj.verify(recording(nominal, real, sockets="AB"), delivered)
+    assert (checked.verdict, checked.verdict_here) == ("not decided", "worse")
+    assert "Record poses in other places" in verification_summary(checked, "", "")["poses_say"]
 
 
 def test_exchanged_arms_have_the_opposite_verdict():
@@ -57,9 +66,9 @@ def test_exchanged_arms_have_the_opposite_verdict():
 def test_what_is_counted():
     """Two sockets: 3 coordinates a pose, less the tip and two positions; a length is one more equation."""
     nominal, real, delivered = arms(3, 1.0, 0.3)
-    plain = aj.verify(recording(nominal, real, 4), delivered)
+    plain = aj.verify(recording(nominal, real, 4, (), "AB"), delivered)
     assert (plain.poses, plain.equations, plain.unknowns) == (8, 24, 9)
-    measured = aj.verify(recording(nominal, real, 4, [aj.ReferenceLength("A", "B", 100.0, u=0.01)]), delivered)
+    measured = aj.verify(recording(nominal, real, 4, [aj.ReferenceLength("A", "B", 100.0, u=0.01)], "AB"), delivered)
     assert (measured.equations, measured.unknowns) == (25, 9)
     assert measured.length_errors.shape == (2, 1)
     q = np.random.default_rng(0).uniform(-2, 2, (8, 6))
