@@ -83,7 +83,7 @@ class Verification(NamedTuple):
     Example:
         >>> checked = aj.verify(aj.Recording(two_bars, nominal), nominal._replace(arm=true))
         >>> print(checked.verdict, checked.poses, checked.equations, checked.unknowns)
-        better 60 184 15
+        better 60 182 15
     """
 
     verdict: Verdict  # of the delivered parameters against the nominal ones
