@@ -9,6 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..camera.consistency import is_mirrored, on_one_line
 from ..core.errors import InputError, naming, nearest
 from ..core.text import quoted, shorten
 from ..core.units import LENGTH_UNITS
@@ -174,8 +175,11 @@ def observations_of(
             used = [i for i, image in enumerate(images) if not image.refused]
             _check_once(q, images, used)
             if not used:
-                reasons = list(dict.fromkeys(f"{quoted(image.label)}: {image.refused}" for image in images))
-                raise InputError(f"no image can be used: {shorten(reasons, 3)}.")
+                labels: dict[str, list[str]] = {}
+                for image in images:
+                    labels.setdefault(image.refused, []).append(quoted(image.label))
+                reasons = [f"{shorten(of_reason, 1)}: {reason}" for reason, of_reason in labels.items()]
+                raise InputError(f"no image can be used ({shorten(reasons, 3)}); take other images, or correct these.")
             observed.append((part.session, _pixels(name, entry, camera, target, q[used], [images[i] for i in used])))
     named_images = {image.image for image in read}
     others = [image for image in seen if image.label not in named_images]
@@ -245,9 +249,19 @@ def _checked(image: Seen, camera: Camera, target: AbstractTarget) -> Seen:
             f"{label} has the point id {ids[counts.argmax()]} twice; give one row for each corner, and one image for "
             "each pose."
         )
-    if not image.refused and len(ids) < _FEWEST:
-        return image._replace(refused=f"only {len(ids)} corners were found; at least {_FEWEST} are needed")
-    return image
+    return image._replace(refused=image.refused or _why_useless(image, target))
+
+
+def _why_useless(image: Seen, target: AbstractTarget) -> str:
+    """Why the corners of an image show no view of a target; empty where they do."""
+    if len(image.ids) < _FEWEST:
+        return f"only {len(image.ids)} corners were found; at least {_FEWEST} are needed"
+    points = target.points_of(image.ids)
+    if on_one_line(points):
+        return f"its {len(points)} corners are on one line"
+    if target.kind != "points" and image.corners.shape[1] == 2 and is_mirrored(points[:, :2], image.corners):
+        return "the board is seen from behind: the image is mirrored, or the ids are counted in another order"
+    return ""
 
 
 def _check_once(q: Float[np.ndarray, "m n"], images: Sequence[Seen], used: Sequence[int]) -> None:

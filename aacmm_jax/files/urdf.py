@@ -36,6 +36,7 @@ from .urdf_text import ExportedUrdf, Robot, UrdfJoint, edited, unused_name
 _REVOLUTION = (-2 * math.pi, 2 * math.pi)  # limits of a continuous joint: readings of -pi to pi and of 0 to 2 pi
 _LONGEST = 50_000.0  # mm; no serial chain is as long
 _LARGEST, _IN_DEGREES = 15.0, 720.0  # rad: limits of joints end below; those in degrees are mostly between
+_SAME_PLACE = 1e-9  # mm: a probe nearer to the tip link than this is no tool beyond it
 _LISTED = 12  # links that a message names
 
 
@@ -85,6 +86,19 @@ class LinkMasses(NamedTuple):
 
     mass: Float[np.ndarray, " n"]  # kg; 0 where the file states none
     centre: Float[np.ndarray, "n 3"]  # mm; 0 where there is no mass
+
+
+def located(source: UrdfSource, arm: Arm) -> UrdfSource:
+    """The same source with its links as seen from the frames of an arm, which may have a tool beyond the tip link; that
+    of a robot as it is."""
+    if arm.chains:
+        return source
+    chain = urdf_chain(source)
+    probe = np.asarray(chain.arm.probe)
+    without_tool = np.allclose(arm.probe, probe, rtol=0, atol=_SAME_PLACE)
+    first = tuple(map(tuple, chain.base.tolist()))
+    follows = chain.tip_joint is not None and without_tool
+    return source._replace(first=first, link=tuple(probe.tolist()), follows=follows)
 
 
 def urdf_chain(source: UrdfSource, *, alone: bool = True) -> UrdfChain:
@@ -225,7 +239,7 @@ def _exported(
     before = geometry_of(nominal.arm)
     frames = calibrated_frames(nominal.origins, before, after, nominal.base, base, branching)
     last = inverse(reduce(np.matmul, frames, np.eye(4)))
-    has_tool = bool(np.linalg.norm(probe - np.asarray(before.probe)) > 1e-9)
+    has_tool = bool(np.linalg.norm(probe - np.asarray(before.probe)) > _SAME_PLACE)
     tip = last @ tip_frame(after, base)
     # A tool is no part of the file: the tip link then follows the last D-H frame alone.
     link = last @ tip_frame(after._replace(probe=before.probe), base) if has_tool else tip

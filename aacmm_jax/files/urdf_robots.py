@@ -14,7 +14,7 @@ from ..kinematics.robots import together
 from .inputs import InputFile
 from .mjcf import with_includes
 from .mjcf_text import parse_robot
-from .urdf import UrdfChain, ends_of, joints_between, listed_links, mimic_of, urdf_chain
+from .urdf import UrdfChain, ends_of, joints_between, listed_links, located, mimic_of, urdf_chain
 from .urdf_text import Robot
 
 
@@ -44,7 +44,8 @@ def read_urdf(
             )
         source = UrdfSource(text, base, "\n".join(dict.fromkeys(chosen)))
         arm = urdf_arm(source)
-        return ArmSpecification(arm if probe is None else with_tool(arm, probe), Path(file).stem, urdf=source)
+        arm = arm if probe is None else with_tool(arm, probe)
+        return ArmSpecification(arm, Path(file).stem, urdf=located(source, arm))
 
 
 def urdf_chains(source: UrdfSource) -> dict[str, UrdfChain]:
