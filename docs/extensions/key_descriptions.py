@@ -38,7 +38,9 @@ DESCRIPTIONS = {
     "sessions": "How the sessions differ.",
     "as_found": "The arm with the parameters that its controller had on arrival: a file as for `arm`.",
     "arm": "A shipped name, an arm file (TOML), a URDF, or a `kinematics.yaml`.",
-    "tip": "For a URDF: the link at the end.",
+    "tip": "For a URDF: the link at the end, or a list of those at the ends of a robot's chains.",
+    "bases": "Rough bases of a robot's arms in the base of the first: x, y, z (mm), and roll, pitch, yaw (deg).",
+    "chain": "For a robot: the chain that the poses of the table are of.",
     "base": "For a URDF: the link that does not move.",
     "acceptance": "Standards for whose acceptance procedure the poses were recorded.",
     "angles": "How readings are written.",
@@ -88,6 +90,11 @@ DESCRIPTIONS = {
     "theta": "Zero offset.",
     "beta": "Hayati's angle.",
     "limits": "Lowest and highest reading.",
+    "fixed": "Numbers of joints that do not move: links before a branch, or below a base.",
+    "mimic": "Joints that follow another one: joint, followed joint, factor, offset (rad, or mm).",
+    "chains": "Chains of a robot: name, and numbers of the joints from the base to the tip.",
+    "joints": "Numbers of the joints of the chain, from 1.",
+    "further_probes": "Tips of the chains after the first, in their last frames.",
     "torques": "In an arm file, whether readings have the torque of each joint beside them; in a manifest, the columns "
     "of these torques, N m.",
     "directions": "In an arm file, whether readings have the direction of approach of each joint beside them; in a "
