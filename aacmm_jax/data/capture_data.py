@@ -12,7 +12,7 @@ from ..core.arrays import Numbers, is_concrete
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray
 from ..core.text import pluralise, shorten
-from ..kinematics.arm import Arm, by_joint
+from ..kinematics.arm import Arm, by_joint, check_chain
 from ..kinematics.correction_kinds import REFERENCE_TEMPERATURE
 from .observations.declared import checked_name, checked_readings
 from .observations.held import Socket, sockets_of
@@ -266,6 +266,7 @@ def check_revolutions(where: str, readings: AnyArray, arm: Arm, advice: str) -> 
 
 def check_beside(where: str, readings: Float[np.ndarray, "... columns"], arm: Arm) -> None:
     """Raise `InputError` where what was recorded beside the joints' readings cannot be what the arm has it for."""
+    check_chain(arm, readings, where)
     columns = {name: readings[..., part] for name, part in arm.beside.slices(readings.shape[-1]).items()}
     check_temperatures(where, columns["thermometer"])
     directions, load = columns["directions"], columns["load"]

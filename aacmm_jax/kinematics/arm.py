@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..core.arguments import NOT_EMPTY, Range, checked, items_of, shown
-from ..core.arrays import Numbers, as_array, as_floats
+from ..core.arrays import Numbers, as_array, as_floats, is_concrete
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, in_chunks, namespace, numpy_if_known, to_jax, to_numpy
 from .beside import COLUMNS, Beside, extras
@@ -247,10 +247,23 @@ def checked_readings(arm: Arm, q: Numbers, like: AnyArray | None = None) -> Floa
     array, joints = as_array(q, "q", like=arm.alpha if like is None else like), arm.joints
     if array.ndim == 0 or array.shape[-1] not in arm.possible_columns:
         raise InputError(
-            f"q has shape {array.shape}, but the arm has {joints} joints{extras(arm.beside.possible)}; the last axis "
-            "must run over the joints."
+            f"q has shape {array.shape}, but the arm has {joints} joints{_beside_joints(arm)}; the last axis must run "
+            "over the joints."
         )
+    check_chain(arm, array, "q")
     return array
+
+
+def check_chain(arm: Arm, readings: AnyArray, where: str) -> None:
+    """Raise `InputError` where known readings of a robot, which ``where`` names, have a number that is no chain's."""
+    if arm.chains and is_concrete(readings):
+        chain = np.asarray(readings)[..., arm.joints]
+        wrong = ~np.isin(chain, np.arange(len(arm.chains)))
+        if np.any(wrong):
+            raise InputError(
+                f"{where} has the chain {chain[wrong].flat[0]:g} in the column after the joints; give the number of a "
+                f"chain, 0 to {len(arm.chains) - 1}."
+            )
 
 
 def with_chains(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m columns"]:
@@ -259,11 +272,15 @@ def with_chains(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m c
     return np.column_stack([q, np.arange(len(q)) % len(arm.chains)]) if arm.chains else q
 
 
+def _beside_joints(arm: Arm) -> str:
+    return ", the number of a chain" * bool(arm.chains) + extras(arm.beside.possible)
+
+
 def check_columns(arm: Arm, columns: int) -> None:
     """Raise `InputError` where readings of a capture have not the columns of an arm; without temperatures it was at
     20 C."""
     if columns not in arm.possible_columns:
-        other = extras(arm.beside.possible)
+        other = _beside_joints(arm)
         if columns == arm.joints + 1:
             other = ", or use an arm with thermometer=True if the last column is the temperature"
         elif columns >= 2 * arm.joints and "torques" not in arm.beside.possible:

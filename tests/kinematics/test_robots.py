@@ -179,6 +179,8 @@ REFUSED = {
     "chain without joints": lambda: LEFT.replace(chains={"left": ()}),
     "joint of no chain": lambda: LEFT.replace(chains={"left": (1, 2)}),
     "chain that goes back": lambda: LEFT.replace(chains={"left": (1, 3, 2, 4, 5, 6)}),
+    "number of no chain": lambda: ROBOTS["trunk"][1].position(np.full(ROBOTS["trunk"][1].joints + 1, 2.0)),
+    "number between chains": lambda: ROBOTS["trunk"][1].position(np.full(ROBOTS["trunk"][1].joints + 1, 0.5)),
     "readings without the chain": lambda: ROBOTS["trunk"][1].position(np.zeros(ROBOTS["trunk"][1].joints)),
 }
 
