@@ -15,7 +15,7 @@ from .observed import tips_of
 
 _LEVER = 1000.0  # mm: of the axes of a frame, which count as points
 _FEWEST = 3  # poses that fit a frame
-_AS_STATED = 1e-6  # weight of the stated rotation, where points in common leave one undetermined
+_AS_STATED = 1e-10  # weight of the stated rotation, where points in common leave one undetermined
 Points = dict[tuple[str, int], Float[np.ndarray, " 3"]]
 
 
@@ -64,7 +64,7 @@ def _fitted(own: Float[np.ndarray, "m 3"], placed: Float[np.ndarray, "m 3"], sta
     """The base in which points of these coordinates come closest to their places (Kabsch 1976)."""
     middle, target = own.mean(axis=0), placed.mean(axis=0)
     moments = (placed - target).T @ (own - middle)
-    u, _, v = np.linalg.svd(moments + max(_AS_STATED * np.linalg.norm(moments), 1e-9) * stated[:3, :3])
+    u, _, v = np.linalg.svd(moments + max(_AS_STATED * np.linalg.norm(moments), 1e-12) * stated[:3, :3])
     base = np.eye(4)
     base[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
     base[:3, 3] = target - base[:3, :3] @ middle

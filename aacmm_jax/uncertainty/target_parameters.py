@@ -6,9 +6,10 @@ from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..data.observations.measured import MeasuredTransforms
 from ..data.observations.observation import offset_of
-from ..kinematics.arm import Arm, correction_names, parameter_names
+from ..kinematics.arm import Arm, correction_names, parameter_names, probe_names, tips_of
 from ..kinematics.correction_kinds import Expansion
 from ..kinematics.parameters import Parameters
+from ..kinematics.robots import chains_of
 from ..model.observed import Observed
 
 # C, range of the temperatures below which a capture says less of the expansion than the material does: 80 poses over a
@@ -55,6 +56,8 @@ def independent_of_targets(arm: Arm, capture: Capture) -> Parameters:
     if any(isinstance(observation, MeasuredTransforms) for observation in observed.observations):
         tip = tip + _AROUND
     chosen = Parameters.independent(arm.replace(probe=tip))
-    n = arm.joints
-    fixed = {f"alpha_{n}", f"a_{n}", f"d_{n}", f"theta_{n}", "probe_x", "probe_y", "probe_z"}
+    fixed = set(probe_names(tips_of(arm)))
+    for own, names in [(chain.arm, chain.names) for chain in chains_of(arm).values()] or [(arm, None)]:
+        last = [f"{kind}_{own.joints}" for kind in ("alpha", "a", "d", "theta")]
+        fixed |= {name if names is None else names[name] for name in last}
     return Parameters(chosen.base.replace(probe=arm.probe), tuple(name for name in chosen.names if name not in fixed))
