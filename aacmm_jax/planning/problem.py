@@ -15,8 +15,8 @@ from ..kinematics.arm import Arm, is_single, jacobian_at, joint_limits
 from ..kinematics.chain import reading_units
 from ..kinematics.collisions import Cell, HalfSpace
 from ..kinematics.corrected_arm import loads_of
-from ..kinematics.correction_kinds import Expansion, Torque
 from ..kinematics.parameters import Parameters
+from ..kinematics.recorded_kinds import Expansion, Torque
 from ..kinematics.workspace import (
     TOOL_AXIS,
     Cone,
