@@ -37,7 +37,9 @@ def recorded(nominal: aj.Arm, joints: tuple[int, ...], seed: int) -> aj.Recordin
 
 def names_backlash(recording: aj.Recording) -> bool:
     """Whether a calibration by Denavit-Hartenberg parameters alone says that residuals follow directions."""
-    said = " ".join(sentences(findings_of(calibrate_capture(recording, model="dh"))))
+    said = " ".join(
+        sentences(findings_of(calibrate_capture(recording, model="dh", cross_validate=False, automatic=False)))
+    )
     return "the direction of approach" in said
 
 
@@ -46,9 +48,9 @@ def trial(nominal: aj.Arm, seed: int) -> dict:
     random = np.random.default_rng(seed)
     joints = tuple(sorted(random.choice(np.arange(1, 6), 2, replace=False).tolist()))
     recording = recorded(nominal, joints, seed)
-    record = calibrate_capture(recording, model="dh,backlash")
+    record = calibrate_capture(recording, model="dh,backlash", cross_validate=False, automatic=False)
     found = {}
-    for i in range(1, 7):
+    for i in range(1, 6):  # play of the last joint turns the tip about itself
         if (name := f"play_{i}") in record.names:
             number = record.names.index(name)
             error = value_of(record.calibrated.arm, name) - PLAY * (i in joints)

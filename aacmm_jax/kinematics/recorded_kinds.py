@@ -70,9 +70,10 @@ class Backlash(AbstractCorrection):
 
     def _by_gravity(self, joint: int, q: Readings, forward: ForwardPass) -> Float[AnyArray, "... 1 N"]:
         xp = namespace(forward)
-        levers = [point - forward.origin_before[joint] for point in (*forward.origin[joint:-1], forward.tip)]
-        moment = -cross(forward.z_before[joint], sum(levers))[..., 2:, :]
-        size = sum(xp.sqrt(xp.sum(lever**2, axis=-2, keepdims=True)) for lever in levers)
+        points = xp.stack([*forward.origin[joint:-1], forward.tip])
+        levers = points - forward.origin_before[joint]
+        moment = -cross(forward.z_before[joint], xp.sum(levers, axis=0))[..., 2:, :]
+        size = xp.sum(xp.sqrt(xp.sum(levers**2, axis=-2, keepdims=True)), axis=0)
         return 0.5 * xp.clip(moment / (_BALANCED * size), -1.0, 1.0)
 
 

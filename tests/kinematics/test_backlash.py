@@ -87,3 +87,14 @@ def test_without_play_nothing_is_named(nominal):
 def test_models_that_are_unknown(nominal, model, message):
     with pytest.raises(aj.InputError, match=message):
         with_corrections(nominal, model)
+
+
+def test_a_calibration_judges_a_capture_with_other_columns(nominal):
+    """Directions that the calibrated arm does not know are left out; those that a capture lacks are unknown."""
+    plain = aj.load_arm("ur10e")
+    sides, none = recorded(nominal, {}), recorded(plain, {}, seed=2)
+    options = {"cross_validate": False, "automatic": False}
+    for arm, capture, other, given in ((plain, none, sides, nominal), (nominal, sides, none, plain)):
+        record = calibrate_capture(aj.Recording(capture, ArmSpecification(arm)), model="dh", **options)
+        judged = aj.evaluate_capture(record, aj.Recording(other, ArmSpecification(given)))
+        assert len(judged.recording.capture.readings) == 80
