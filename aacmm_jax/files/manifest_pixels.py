@@ -9,6 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..camera.consistency import is_mirrored, on_one_line
 from ..core.errors import InputError, naming, nearest
 from ..core.text import quoted, shorten
 from ..core.units import LENGTH_UNITS
@@ -19,14 +20,13 @@ from ..data.observations.pixels import Pixels
 from ..data.recording import ReadImage
 from ..data.targets import AbstractTarget, target_of
 from .camera_files import read_camera
-from .corner_files import NO_CORNERS, Seen, matched, natural_order, read_corners
+from .corner_files import NO_CORNERS, Seen, corners_of_json, corners_of_table, matched, natural_order
 from .manifest_cameras import CameraTable, PixelsTable, TargetTable
 from .manifest_files import as_list
 from .manifest_readings import checked_unit
 from .manifest_rows import Source, parts
 from .outputs import write_atomically
 from .patterns import fill
-from .text_table import TextTable
 
 _FEWEST = 4  # corners of an image that determine the pose of a board
 Progress = Callable[[Sequence[Any], str], Iterable[Any]]  # shows how many of the items are done
@@ -86,7 +86,7 @@ class Cameras:
 
 def _points_of(source: Source, table: TargetTable) -> dict[str, Any]:
     """Ids and coordinates, mm, of a table of points."""
-    text = TextTable(source.open(str(table.file)), decimal=None)
+    text = source.table(str(table.file), decimal=None, tables=as_list(table.table or []))
     ids = text.numbers(text.pick(as_list(table.columns.get("id", "id"))))[:, 0]
     picked = text.pick(as_list(table.columns.get("points", ["x", "y", "z"])))
     if len(picked) != 3:
@@ -175,8 +175,11 @@ def observations_of(
             used = [i for i, image in enumerate(images) if not image.refused]
             _check_once(q, images, used)
             if not used:
-                reasons = list(dict.fromkeys(f"{quoted(image.label)}: {image.refused}" for image in images))
-                raise InputError(f"no image can be used: {shorten(reasons, 3)}.")
+                labels: dict[str, list[str]] = {}
+                for image in images:
+                    labels.setdefault(image.refused, []).append(quoted(image.label))
+                reasons = [f"{shorten(of_reason, 1)}: {reason}" for reason, of_reason in labels.items()]
+                raise InputError(f"no image can be used ({shorten(reasons, 3)}); take other images, or correct these.")
             observed.append((part.session, _pixels(name, entry, camera, target, q[used], [images[i] for i in used])))
     named_images = {image.image for image in read}
     others = [image for image in seen if image.label not in named_images]
@@ -193,8 +196,12 @@ def _seen(
 ) -> list[Seen]:  # fmt: skip
     """The corners of each image: detected, or read from a table."""
     if entry.corners is not None:
-        file = source.open(fill(entry.corners, values))
-        return read_corners(file, target, camera_models()[camera.model].dimension, entry.corner_columns)
+        file, dimension = fill(entry.corners, values), camera_models()[camera.model].dimension
+        if file.lower().endswith(".json"):
+            return corners_of_json(source.open(file), target, dimension)
+        named = as_list(entry.corner_table or (entry.table if file in entry.paths else None) or [])
+        text = source.table(file, decimal=None, tables=named, corners=dimension)
+        return corners_of_table(text, dimension, entry.corner_columns)
     pattern = fill(str(entry.images), values)
     size = None if camera.image_size is None else tuple(int(number) for number in camera.image_size)
     found, key = {} if detecting.found is None else detecting.found, (pattern, fill(entry.target, values), size)
@@ -242,9 +249,19 @@ def _checked(image: Seen, camera: Camera, target: AbstractTarget) -> Seen:
             f"{label} has the point id {ids[counts.argmax()]} twice; give one row for each corner, and one image for "
             "each pose."
         )
-    if not image.refused and len(ids) < _FEWEST:
-        return image._replace(refused=f"only {len(ids)} corners were found; at least {_FEWEST} are needed")
-    return image
+    return image._replace(refused=image.refused or _why_useless(image, target))
+
+
+def _why_useless(image: Seen, target: AbstractTarget) -> str:
+    """Why the corners of an image show no view of a target; empty where they do."""
+    if len(image.ids) < _FEWEST:
+        return f"only {len(image.ids)} corners were found; at least {_FEWEST} are needed"
+    points = target.points_of(image.ids)
+    if on_one_line(points):
+        return f"its {len(points)} corners are on one line"
+    if target.kind != "points" and image.corners.shape[1] == 2 and is_mirrored(points[:, :2], image.corners):
+        return "the board is seen from behind: the image is mirrored, or the ids are counted in another order"
+    return ""
 
 
 def _check_once(q: Float[np.ndarray, "m n"], images: Sequence[Seen], used: Sequence[int]) -> None:

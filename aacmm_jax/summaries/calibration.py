@@ -72,7 +72,7 @@ def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
             for name, coefficient in kinds.items()
         ],
         "held": list(specification.space().held),
-        "urdf": None if urdf is None else {"base": urdf.base, "tip": urdf.tip},
+        "urdf": None if urdf is None else {"format": urdf.format, "base": urdf.base, "tip": urdf.tip},
     }
 
 
@@ -99,6 +99,7 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
         "sockets": rows_of(socket=capture.names, poses=capture.sizes),
         "observations": capture_observations(capture),
         "images": image_rows(recording),
+        "notes": list(recording.notes),
         "lengths": reference_length_rows(capture.lengths, u_mm=[float(length.u) for length in capture.lengths]),
         "ranges": [
             {"joint": i, f"lowest_{unit}": low, f"highest_{unit}": high}

@@ -4,6 +4,10 @@ POINT = "Position in the base frame, mm."
 DESCRIPTIONS = {
     # Manifests
     "file": "Path of the file, relative to this file; for sockets and observations, it may have fields in braces.",
+    "table": "What is read in a file that is not a text table: variables, a sheet, topics, a feature.",
+    "readings_table": "The same as `table`, for the file of `readings`.",
+    "PixelsTable.corner_table": "The same as `table`, for the file of `corners`.",
+    "Angles.calibration": "LeRobot's calibration file, with which its counts, degrees or percent become angles.",
     "files": "Several files, instead of `file`; for an artefact also `{ point = file }`.",
     "exclude": "Shell patterns of files to leave out.",
     "session": "Session in which the data were recorded; the probe was remounted between sessions.",
@@ -211,6 +215,7 @@ DESCRIPTIONS = {
     "KitPixels.distance": "Least and largest distance of the target from the camera, mm, at which images are sharp.",
     "KitPixels.tilt_deg": "Largest angle between the target's normal and the line of sight, deg.",
     "KitPixels.u": "Standard deviation of a coordinate of a corner, px.",
+    "KitPixels.poses": "Number of poses that are simulated. A plan chooses its own number.",
     "_Kit.points": "An instrument that measures points.",
     "Distribution.normal": "Standard deviation of a normal distribution.",
     "_Box.rotation": "Rotation vector, rad.",
