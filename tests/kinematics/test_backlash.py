@@ -11,6 +11,7 @@ from aacmm_jax.kinematics.parameters import ArmSpecification
 from aacmm_jax.pipeline.capture_calibration import calibrate_capture
 from aacmm_jax.pipeline.model_ladder import default_models
 
+QUICKLY = {"cross_validate": False, "automatic": False}
 PLAY = {"play_2": np.radians(0.2), "play_5": np.radians(0.2)}
 SOCKETS = {"A": (400, 200, 300), "B": (700, -200, 200), "C": (300, -500, 500), "D": (-400, 400, 300)}
 
@@ -61,23 +62,25 @@ def recorded(nominal, coefficients, seed=1, encoder=72):
     return aj.simulate(true, SOCKETS, poses=20, lengths=lengths, noise=noise, seed=seed)
 
 
+@pytest.mark.slow
 def test_backlash_is_named_and_found(nominal):
     capture = recorded(nominal, PLAY)
     assert capture.columns == 12
     assert default_models(nominal, capture)[:4] == ("dh", "backlash", "gravity", "gravity,backlash")
     recording = aj.Recording(capture, ArmSpecification(nominal))
-    plain = calibrate_capture(recording, model="dh")
+    plain = calibrate_capture(recording, model="dh", **QUICKLY)
     text = " ".join(sentences(findings_of(plain)))
     assert "the direction of approach of joint" in text
     assert "--model dh,backlash" in text
-    record = calibrate_capture(recording, model="dh,backlash")
+    record = calibrate_capture(recording, model="dh,backlash", **QUICKLY)
     for name, value in PLAY.items():
         number = record.names.index(name)
         assert abs(value_of(record.calibrated.arm, name) - value) < 3 * np.sqrt(record.covariance[number, number])
 
 
+@pytest.mark.slow
 def test_without_play_nothing_is_named(nominal):
-    record = calibrate_capture(aj.Recording(recorded(nominal, {}), ArmSpecification(nominal)), model="dh")
+    record = calibrate_capture(aj.Recording(recorded(nominal, {}), ArmSpecification(nominal)), model="dh", **QUICKLY)
     assert not [sentence for sentence in sentences(findings_of(record)) if "backlash" in sentence]
 
 
@@ -89,12 +92,12 @@ def test_models_that_are_unknown(nominal, model, message):
         with_corrections(nominal, model)
 
 
+@pytest.mark.slow
 def test_a_calibration_judges_a_capture_with_other_columns(nominal):
     """Directions that the calibrated arm does not know are left out; those that a capture lacks are unknown."""
     plain = aj.load_arm("ur10e")
     sides, none = recorded(nominal, {}), recorded(plain, {}, seed=2)
-    options = {"cross_validate": False, "automatic": False}
     for arm, capture, other, given in ((plain, none, sides, nominal), (nominal, sides, none, plain)):
-        record = calibrate_capture(aj.Recording(capture, ArmSpecification(arm)), model="dh", **options)
+        record = calibrate_capture(aj.Recording(capture, ArmSpecification(arm)), model="dh", **QUICKLY)
         judged = aj.evaluate_capture(record, aj.Recording(other, ArmSpecification(given)))
         assert len(judged.recording.capture.readings) == 80
