@@ -112,7 +112,9 @@ def test_directions_and_loads(tmp_path, motion):
     np.testing.assert_array_equal(read(tmp_path, HEAD + ANGLES + socket).sockets["a"], expected)
     assert aj.files.read_manifest(tmp_path / "capture.toml").nominal.arm.recorded == ("directions", "load")
     rises, stays, falls = 0.5, 0.501, 0.2  # a joint that hardly moves stays on its side
-    record(tmp_path / "b.csv", np.tile([[0.0], [rises], [stays], [falls]], (1, 6)), header="q1,q2,q3,q4,q5,q6\n")
+    record(
+        tmp_path / "b.csv", np.add.outer([0.0, rises, stays, falls], 0.1 * np.arange(6)), header="q1,q2,q3,q4,q5,q6\n"
+    )
     ordered = HEAD + ANGLES + 'directions = "order"\n[[socket]]\nfile = "b.csv"\nload_kg = 2.5\n'
     found = read(tmp_path, ordered).sockets["b"]
     np.testing.assert_array_equal(found[:, 6:], np.repeat([[0, 2.5], [1, 2.5], [1, 2.5], [-1, 2.5]], [6, 1], axis=1))
