@@ -341,12 +341,13 @@ def correct(
 def _at_temperature(commanded: Any, calibrated: Any, temperature: float | None) -> np.ndarray:
     """The readings, with the temperature of an arm that expands."""
     from ..data.capture_data import check_temperatures
-    from ..files.manifest_readings import with_temperature
+    from ..files.manifest_readings import stated_or_recorded
+    from ..files.table_columns import TEMPERATURE
     from ..kinematics.arm import correction_names
     from ..kinematics.corrected_arm import loads_of
     from ..kinematics.correction_kinds import Expansion
 
-    torques = calibrated.corrections is not None and calibrated.corrections.functions.by_torque
+    torques = calibrated.corrections is not None and "torques" in calibrated.corrections.functions.columns
     if torques and loads_of(calibrated) is None:
         raise InputError(
             "the arm was calibrated with measured torques, but those of commanded poses are unknown without masses; "
@@ -361,9 +362,11 @@ def _at_temperature(commanded: Any, calibrated: Any, temperature: float | None) 
             "the arm was calibrated with its thermal expansion; give --temperature, or a column temperature_C."
         )
     table = str(commanded.table.path)
-    q = with_temperature(commanded.q, commanded.temperature, temperature, table)
-    check_temperatures("--temperature" if commanded.temperature is None else table, q[:, calibrated.joints :])
-    return q
+    column = None if commanded.temperature is None else commanded.temperature[:, None]
+    recorded = stated_or_recorded(temperature, column, TEMPERATURE, table, len(commanded.q))
+    assert recorded is not None
+    check_temperatures("--temperature" if commanded.temperature is None else table, recorded)
+    return calibrated.beside.laid_out(np.hstack([commanded.q, recorded]), ("thermometer",))
 
 
 def in_first_frame(record: Any, poses: np.ndarray) -> np.ndarray:

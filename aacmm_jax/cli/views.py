@@ -106,6 +106,9 @@ def capture(summary: dict[str, Any]) -> View:
     if summary["largest_torques_Nm"] is not None:
         torques = ", ".join(f"{torque:.3g}" for torque in summary["largest_torques_Nm"])
         yield f"Largest torques of the joints: {torques} N m."
+    if summary["load_kg"] is not None:
+        low, high = summary["load_kg"]
+        yield f"Load at the tip: {low:.3g} to {high:.3g} kg."
     if summary["temperature_C"] is not None:
         low, high = summary["temperature_C"]
         yield f"Temperature: {low:.2f} to {high:.2f} C."

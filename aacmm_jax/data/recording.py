@@ -66,12 +66,14 @@ class ReadImage(NamedTuple):
         image: Name of the file, or number of the pose.
         corners: Number of corners.
         refused: Why the image is not used; empty where it is.
+        preview: A small picture of it (JPEG, in base64); None or empty where there is none.
     """
 
     observation: str
     image: str
     corners: int
     refused: str = ""
+    preview: str | None = None
 
 
 class ReadingSet(NamedTuple):

@@ -12,8 +12,9 @@ from ..core.errors import InputError, naming, nearest
 from ..core.text import printable
 from ..data.capture import Capture
 from ..data.noise import ArmNoise
-from ..kinematics.arm import Arm, correction_names, is_length
+from ..kinematics.arm import Arm, correction_names, is_length, reading_as
 from ..kinematics.axes_to_dh import without_far_frames
+from ..kinematics.beside import COLUMNS
 from ..kinematics.corrected_arm import loads_of
 from ..kinematics.independence import nearly_parallel
 from ..kinematics.parameters import ArmSpecification, single, with_tool
@@ -194,8 +195,7 @@ def _specification(path: Path, model: ArmFile, probe: Numbers | None) -> ArmSpec
         arm = _arm_of_rows(model)
         specification = ArmSpecification(arm if probe is None else with_tool(arm, probe))
     arm = specification.arm
-    if model.torques or model.thermometer:
-        arm = arm.replace(torques=model.torques, thermometer=model.thermometer)
+    arm = reading_as(arm, [name for name in COLUMNS if getattr(model, name)])
     if model.corrections is not None:
         arm = model.corrections.corrected(arm, units)
     prior = None if model.priors is None else model.priors.prior(arm, units)
@@ -305,7 +305,7 @@ def specification_toml(specification: ArmSpecification, *, source: str = "", pro
     document.update({"convention": "standard", "length_unit": "mm", "angle_unit": "rad"})
     geometry = {kind: np.asarray(getattr(arm, kind)).tolist() for kind in GEOMETRY if getattr(arm, kind) is not None}
     document["probe"] = geometry.pop("probe")
-    facts = {"prismatic": list(arm.prismatic), "torques": arm.torques, "thermometer": arm.thermometer}
+    facts = {"prismatic": list(arm.prismatic)} | dict.fromkeys(arm.recorded, True)
     document.update({key: fact for key, fact in facts.items() if fact})
     rows = tomlkit.array().multiline(True)
     for i in range(arm.joints):

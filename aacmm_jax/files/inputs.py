@@ -46,8 +46,11 @@ class InputFile(os.PathLike):
     @property
     def text(self) -> str:
         """The content as text in UTF-8, with or without a byte order mark; lines end with a line feed. Raises
-        `UnicodeDecodeError`."""
-        return self.content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+        `InputError`."""
+        try:
+            return self.content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+        except UnicodeDecodeError as error:
+            raise InputError(f"{self} is not UTF-8 text; save it as UTF-8.") from error
 
 
 @contextlib.contextmanager

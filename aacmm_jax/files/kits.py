@@ -10,7 +10,7 @@ from pydantic import Field, FiniteFloat, NonNegativeInt, PositiveFloat, Positive
 from ..core.errors import InputError, naming
 from ..core.units import DEG
 from ..data.observations.declared import FREE
-from ..data.observations.observation import AbstractSimulated, simulated_kinds
+from ..data.observations.simulated import AbstractSimulated, simulated_kinds
 from ..data.observations.simulated_pixels import SimulatedPixels
 from ..planning.kit_placement import KitItem
 from .inputs import InputFile

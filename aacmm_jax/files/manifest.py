@@ -16,8 +16,7 @@ from ..core.text import shorten
 from ..data.capture import Capture, ReferenceLength, check_readings, join_sessions
 from ..data.observations.held import Socket
 from ..data.recording import ProbedSphere, ReadImage, Recording, checked_sphere
-from ..kinematics.arm import Arm
-from ..kinematics.chain import beside_joints
+from ..kinematics.arm import Arm, reading_as
 from ..kinematics.parameters import ArmSpecification
 from ..kinematics.workspace import Reach
 from .arms import arm_beside, for_capture, read_arm, usual_noise
@@ -66,9 +65,9 @@ def read_manifest(
         (40,)
     """
     manifest = path if isinstance(path, InputFile) else InputFile(path)
-    detecting = Detecting(progress, None if overlays is None else Path(overlays))
+    detecting = Detecting(progress, None if overlays is None else Path(overlays), {})
     recording, readings = _read(manifest, detecting)
-    other = other_readings(manifest, recording, readings.header, lambda changed: _read(changed)[0])
+    other = other_readings(manifest, recording, readings.header, lambda changed: _read(changed, detecting)[0])
     return recording._replace(other_readings=other)
 
 
@@ -110,9 +109,7 @@ def _read(path: str | os.PathLike, detecting: Detecting = _QUIETLY) -> tuple[Rec
                 "[sessions] applies only to tables with a session, but no table has a session; remove [sessions]."
             )
         capture = _capture(lengths, observed, probe == "remounted")
-        torques, temperature = beside_joints(nominal.arm.joints, capture.columns)
-        beside = {"torques": torques.stop > torques.start, "thermometer": temperature.start < capture.columns}
-        nominal = nominal._replace(arm=nominal.arm.replace(**{key: True for key, given in beside.items() if given}))
+        nominal = nominal._replace(arm=reading_as(nominal.arm, readings.beside))
         check_readings(capture, nominal.arm)
         as_found = None if model.as_found is None else _as_found(arm_beside(path.parent, model.as_found), nominal.arm)
         recording = Recording(
@@ -148,7 +145,7 @@ def _stated(model: Any) -> tuple[str, ...]:
 def _as_found(file: str | Path, nominal: Arm) -> ArmSpecification:
     """The arm as it arrived, which reads as the nominal one does."""
     specification = read_arm(file)[0]
-    arm = specification.arm.replace(torques=nominal.torques, thermometer=nominal.thermometer)
+    arm = reading_as(specification.arm, nominal.recorded)
     if (arm.joints, arm.prismatic) != (nominal.joints, nominal.prismatic):
         raise InputError(
             f"as_found = '{Path(file).name}' has {arm.joints} joints or other prismatic joints than arm, which has "

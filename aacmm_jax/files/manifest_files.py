@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import AfterValidator, Field, FiniteFloat, NonNegativeInt, PositiveInt, model_validator
+from pydantic import AfterValidator, Field, FiniteFloat, NonNegativeFloat, NonNegativeInt, PositiveInt, model_validator
 
 from .table_columns import OF_UR
 from .text_lines import Column
@@ -82,6 +82,7 @@ class Table(Strict):
     skip: NonNegativeInt = 0
     group: PositiveInt | str | None = None
     temperature_C: FiniteFloat | None = None  # of the arm, where the table has no such column
+    load_kg: NonNegativeFloat | None = None  # likewise, at the tip
 
     @model_validator(mode="after")
     def _one_source(self) -> Any:

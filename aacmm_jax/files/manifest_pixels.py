@@ -1,5 +1,6 @@
 """[[pixels]] of a manifest: images of a target, or tables of corners, with the readings of their poses."""
 
+import base64
 import glob
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -18,7 +19,7 @@ from ..data.observations.pixels import Pixels
 from ..data.recording import ReadImage
 from ..data.targets import AbstractTarget, target_of
 from .camera_files import read_camera
-from .corner_tables import NO_CORNERS, Seen, matched, natural_order, read_corners
+from .corner_files import NO_CORNERS, Seen, matched, natural_order, read_corners
 from .manifest_cameras import CameraTable, PixelsTable, TargetTable
 from .manifest_files import as_list
 from .manifest_readings import checked_unit
@@ -41,6 +42,7 @@ class Detecting(NamedTuple):
 
     progress: Progress = without_progress
     overlays: Path | None = None  # folder of a picture for each image, with the corners that were found in it
+    found: dict[Any, list[Seen]] | None = None  # in images that were read before, by where they are and what is in them
 
 
 class _Poses(Declared):
@@ -169,7 +171,7 @@ def observations_of(
                 for i in matched([image.label for image in seen], wanted, len(q))
             ]
             named = "/".join(filter(None, (part.session, name)))
-            read += [ReadImage(named, image.label, len(image.ids), image.refused) for image in images]
+            read += [_read(named, image, image.refused) for image in images]
             used = [i for i, image in enumerate(images) if not image.refused]
             _check_once(q, images, used)
             if not used:
@@ -178,7 +180,11 @@ def observations_of(
             observed.append((part.session, _pixels(name, entry, camera, target, q[used], [images[i] for i in used])))
     named_images = {image.image for image in read}
     others = [image for image in seen if image.label not in named_images]
-    return observed, [*read, *(ReadImage(name, x.label, len(x.ids), "no row of the readings names it") for x in others)]
+    return observed, [*read, *(_read(name, image, "no row of the readings names it") for image in others)]
+
+
+def _read(observation: str, image: Seen, refused: str) -> ReadImage:
+    return ReadImage(observation, image.label, len(image.ids), refused, image.preview)
 
 
 def _seen(
@@ -189,24 +195,35 @@ def _seen(
     if entry.corners is not None:
         file = source.open(fill(entry.corners, values))
         return read_corners(file, target, camera_models()[camera.model].dimension, entry.corner_columns)
-    from ..camera.detection import detect, overlay
-
     pattern = fill(str(entry.images), values)
+    size = None if camera.image_size is None else tuple(int(number) for number in camera.image_size)
+    found, key = {} if detecting.found is None else detecting.found, (pattern, fill(entry.target, values), size)
+    if key not in found:
+        found[key] = _detected(source, pattern, target, size, detecting)
+    return found[key]
+
+
+def _detected(
+    source: Source, pattern: str, target: AbstractTarget, size: tuple[int, ...] | None, detecting: Detecting
+) -> list[Seen]:
+    """The corners that images show."""
+    from ..camera.detection import detect, overlay, preview, read_image
+
     paths = [Path(path) for path in glob.glob(str(Path(glob.escape(str(source.folder))) / pattern), recursive=True)]
     names = natural_order([path.relative_to(source.folder).as_posix() for path in paths if path.is_file()])
     if not names:
         raise InputError(f"no image matches '{pattern}' in {source.folder}; check the path.")
-    size = None if camera.image_size is None else tuple(int(number) for number in camera.image_size)
     seen = []
     for name in detecting.progress(names, "Detecting corners"):
-        image = source.open(name)
+        image = read_image(source.open(name))
         found = detect(image, target, image_size=size)
         if detecting.overlays is not None:
             detecting.overlays.mkdir(parents=True, exist_ok=True)
             # Images of several folders may have the same name.
             with write_atomically(detecting.overlays / f"{name.replace('/', '_')}.jpg") as path:
                 path.write_bytes(overlay(image, found))
-        seen.append(Seen(name, found.ids, found.corners, found.refused, found.size))
+        small = base64.b64encode(preview(image)).decode()
+        seen.append(Seen(name, found.ids, found.corners, found.refused, found.size, small))
     return seen
 
 

@@ -168,7 +168,7 @@ class _Reader:
             table.units.get(source.quantity),
             self._preset.units.get(source.quantity),
             [i for columns in others for i in text.pick(columns)] if readings is text else [],
-            table.temperature_C,
+            {"load": table.load_kg, "thermometer": table.temperature_C},
         )
         rows_of = {source.quantity: (rows := source.rows(readings, wanted))}
         rows_of |= {key: self._column(text, self.entries[key], columns) for key, columns in chosen.items()}

@@ -23,8 +23,9 @@ from ..core.errors import InputError
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import ReferenceLength
 from ..data.observations.held import Socket
-from ..data.observations.observation import AbstractObservation, kinds
+from ..data.observations.observation import AbstractObservation
 from ..data.observations.pixels import Pixels
+from ..data.observations.simulated import kinds
 from ..data.recording import SphereTest
 from ..kinematics.arm import Arm, by_joint
 from ..kinematics.correction_kinds import REFERENCE_TEMPERATURE
@@ -57,6 +58,7 @@ class Angles(Strict):
     offset: FiniteFloat | list[FiniteFloat] = 0.0
     columns: Picked | None = None
     torques: Picked | None = None  # columns of the joints' torques, N m
+    directions: Picked | None = None  # columns of the directions from which the joints were moved: 1, -1, or 0
     linear_unit: Literal["mm", "m", "um", "inch", "counts"] = "mm"  # of prismatic joints
     counts_per_mm: _ByJoint | None = None
 
@@ -236,9 +238,9 @@ class PointsManifest(Recorded):
     def _one_tip(self) -> "PointsManifest":
         for entry in (*self.socket, *self.sphere):
             seated = isinstance(entry, SocketTable) and (entry.target or entry.session)
-            if seated or entry.temperature_C is not None:
+            if seated or (entry.temperature_C, entry.load_kg) != (None, None):
                 raise ValueError(
-                    "target, session and temperature_C apply only to manifests of joint readings, but "
+                    "target, session, temperature_C and load_kg apply only to manifests of joint readings, but "
                     f"'{entry.name or entry.paths[0]}' has points, which are positions of the tip; remove these keys."
                 )
         return self

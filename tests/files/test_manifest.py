@@ -83,7 +83,7 @@ def test_torques(tmp_path, motion):
     recording = aj.files.read_manifest(tmp_path / "capture.toml")
     expected = np.column_stack([motion, loads, table[:, 3]])
     np.testing.assert_array_equal(recording.capture.sockets["a"], expected)
-    assert (recording.nominal.arm.torques, recording.nominal.arm.thermometer) == (True, True)
+    assert recording.nominal.arm.recorded == ("torques", "thermometer")
     record(tmp_path / "b.csv", np.column_stack([motion, loads]), header="q1,q2,q3,q4,q5,q6,l1,l2,l3,l4,l5,l6\n")
     chosen = read(tmp_path, HEAD + ANGLES + 'torques = "l*"\n' + socket.replace("a.csv", "b.csv"))
     np.testing.assert_array_equal(chosen.sockets["b"], expected[:, :12])

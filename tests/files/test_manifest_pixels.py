@@ -1,5 +1,6 @@
 """[[pixels]] in manifests: tables of corners and nested lists, which image belongs to which pose, and bad input."""
 
+import base64
 import json
 import shutil
 from pathlib import Path
@@ -8,11 +9,14 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.camera import detection
 from tests.refusals import assert_refused
 
 TARGET = '[[target]]\nname = "board"\nkind = "charuco"\nsquares = [6, 5]\nsize = 30.0\nmarker = 22.0\n'
 CAMERA = '[[camera]]\nname = "webcam"\nimage_size = [640, 480]\n'
 PIXELS = '[[pixels]]\ncamera = "webcam"\ntarget = "board"\nfile = "joints.csv"\ncorners = "corners.csv"\n'
+HUGE = b"\xff\xd8\xff\xc0\x00\x0b\x08\xff\xff\xff\xff\x01\x01\x11\x00"  # 65535 x 65535 px
+JPEG_OF_HUGE_SIZE = base64.b64encode(HUGE).decode()
 JOINTS = [f"q_{i}_deg" for i in range(1, 7)]
 
 
@@ -187,16 +191,40 @@ def test_as_many_poses_as_images(tmp_path, seen):
     assert_refused(lambda: read(tmp_path), "11 images and 12 poses")
 
 
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "webcam"
+
+
+def part_of_example(folder, count):
+    """The first images of the rendered example, with their readings, which are returned, and its manifest."""
+    (folder / "images").mkdir()
+    for image in sorted((EXAMPLE / "images").iterdir())[:count]:
+        shutil.copy(image, folder / "images")
+    rows = (EXAMPLE / "joints.csv").read_text().splitlines()[: count + 1]
+    (folder / "joints.csv").write_text("\n".join(rows) + "\n")
+    shutil.copy(EXAMPLE / "webcam.toml", folder)
+    return rows
+
+
+def test_corners_are_detected_once_where_readings_are_commanded_and_measured(tmp_path, monkeypatch):
+    """The manifest is read again with the other readings."""
+    pytest.importorskip("cv2")
+    head, *rows = part_of_example(tmp_path, 4)
+    both = [",".join(f"{name.split()[0]}_{role} [deg]" for name in head.split(",")[1:]) for role in ("cmd", "meas")]
+    twice = [f"{row},{','.join(str(float(number) + 0.1) for number in row.split(',')[1:])}" for row in rows]
+    (tmp_path / "joints.csv").write_text("\n".join([f"image,{both[0]},{both[1]}", *twice]) + "\n")
+    text = (tmp_path / "webcam.toml").read_text() + 'columns = { q = ["J*_meas*"] }\n'
+    (tmp_path / "webcam.toml").write_text(text)
+    detected, detect = [], detection.detect
+    monkeypatch.setattr(detection, "detect", lambda *given, **named: detected.append(1) or detect(*given, **named))
+    recording = aj.files.read_manifest(tmp_path / "webcam.toml")
+    assert recording.other_readings.role == "commanded"
+    assert len(recording.other_readings.capture.observations[0].q) == len(detected) == 4
+
+
 def test_images_are_read_and_drawn(tmp_path):
     cv2 = pytest.importorskip("cv2")
-    example = Path(__file__).resolve().parents[2] / "examples" / "webcam"
-    (tmp_path / "images").mkdir()
-    for image in sorted((example / "images").iterdir())[:5]:
-        shutil.copy(image, tmp_path / "images")
-    cv2.imwrite(str(tmp_path / "images" / image.name), np.full((480, 640), 128, dtype=np.uint8))  # nothing in it
-    rows = (example / "joints.csv").read_text().splitlines()[:6]
-    (tmp_path / "joints.csv").write_text("\n".join(rows) + "\n")
-    shutil.copy(example / "webcam.toml", tmp_path)
+    rows = part_of_example(tmp_path, 5)
+    cv2.imwrite(str(tmp_path / "images" / "05.jpg"), np.full((480, 640), 128, dtype=np.uint8))  # nothing in it
     shown = []
 
     def progress(items, what):
@@ -210,3 +238,17 @@ def test_images_are_read_and_drawn(tmp_path):
     assert recording.images[4].refused
     assert recording.capture.observations[0].images == tuple(f"images/{row[:6]}" for row in rows[1:5])
     assert len([cv2.imread(str(path)).shape for path in overlays.iterdir()]) == 5
+    for image in recording.images:  # those refused too
+        small = cv2.imdecode(np.frombuffer(base64.b64decode(image.preview), np.uint8), cv2.IMREAD_UNCHANGED)
+        assert small.shape == (240, 320)
+    aj.files.save_capture(tmp_path / "capture.h5", recording)
+    assert aj.files.load_capture(tmp_path / "capture.h5").images == recording.images
+
+
+@pytest.mark.parametrize("picture", ["no base64!", "aGVsbG8=", JPEG_OF_HUGE_SIZE], ids=["text", "no JPEG", "huge"])
+def test_a_picture_in_a_file_that_a_browser_should_not_decode_is_refused(tmp_path, seen, picture):
+    files(tmp_path, seen)
+    recording = read(tmp_path)
+    recording = recording._replace(images=(recording.images[0]._replace(preview=picture), *recording.images[1:]))
+    aj.files.save_capture(tmp_path / "capture.h5", recording)
+    assert_refused(lambda: aj.files.load_capture(tmp_path / "capture.h5"), "not a small JPEG")

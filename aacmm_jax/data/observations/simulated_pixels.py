@@ -11,8 +11,9 @@ from ...core.errors import InputError
 from ...core.rotations import rotation_matrix
 from ..cameras.camera import AbstractCamera, camera_models
 from .declared import FREE, declared
-from .observation import AbstractSimulated, Aim, Readings, Transforms
+from .observation import Readings, Transforms
 from .pixels import Pixels
+from .simulated import AbstractSimulated, Aim
 
 _TRIED, _MOST_TRIED = 10, 500  # random poses for each one that is wanted, over the share of directions within the tilt
 _ASIDE = 0.35  # of the target's size: how far from its middle the camera looks

@@ -42,6 +42,7 @@ class Seen(NamedTuple):
     corners: Float[np.ndarray, "k d"]
     refused: str = ""  # why it is not used
     size: tuple[int, int] | None = None  # width, height, px
+    preview: str | None = None  # small picture (JPEG, base64)
 
 
 def read_corners(file: InputFile, target: AbstractTarget, dimensions: int, columns: Mapping[Any, Picked]) -> list[Seen]:
@@ -79,8 +80,9 @@ def read_corners(file: InputFile, target: AbstractTarget, dimensions: int, colum
 
 
 def _of_json(file: InputFile, target: AbstractTarget, dimensions: int) -> list[Seen]:
+    text = file.text
     try:
-        content: Any = json.loads(file.text)
+        content: Any = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{file} is not valid JSON ({error}); correct the file.") from error
     content = (
