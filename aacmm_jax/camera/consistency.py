@@ -1,8 +1,8 @@
 """Whether corners in an image can be those of a target: a check that needs no intrinsics.
 
 A flat target appears through a homography, which distortion bends smoothly: about the middle of the image, as one
-number describes well enough (r / (1 - n r^2) of the distances r: Fitzgibbon 2001), and a little otherwise. A corner that
-was taken for another one is off by a good part of a square, which no smooth bending explains.
+number describes well enough (r / (1 - n r^2) of the distances r: Fitzgibbon 2001), and a little otherwise. A corner
+that was taken for another one is off by a good part of a square, which no smooth bending explains.
 """
 
 import numpy as np

@@ -20,6 +20,7 @@ from .evidence import BORDER, FEWEST, Grey, Refusal, inside, points_of, why_noth
 from .markers import tag_corners, target_markers
 from .squares import charuco_corners, checkerboard_corners
 
+_MOST_PIXELS = 120_000_000  # of an image
 _BLURRED = 0.12  # the most blur, of the distance between neighbouring corners
 _WIDEST, _MOST_BLUR = 7.0, 3.0  # px: the width across edges in which blur is measured, and the most of it
 _PREVIEW = 320  # px: the larger side of a picture for a report
@@ -113,6 +114,7 @@ def read_image(image: str | os.PathLike | np.ndarray) -> Grey:
             )
         return image
     require("camera", "Detection of corners in images")
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(_MOST_PIXELS))  # which OpenCV reads when it is imported
     import cv2
 
     content = getattr(image, "content", None)  # of a file that was read already
@@ -126,7 +128,10 @@ def read_image(image: str | os.PathLike | np.ndarray) -> Grey:
     except cv2.error:  # such as an image of billions of pixels
         grey = None
     if grey is None:
-        raise InputError(f"{image} is not an image that OpenCV reads; give a PNG or JPEG file.")
+        raise InputError(
+            f"{image} is not an image that OpenCV reads, is damaged, or has more than {_MOST_PIXELS // 10**6} million "
+            "px; give a PNG or JPEG file."
+        )
     return np.asarray(grey)
 
 

@@ -76,7 +76,7 @@ def fitting(
         kept = np.delete(kept, np.argmax(misfit))
     if len(kept) < (1 - _MOST_APART) * len(ids) or (len(kept) and worst > max(_MISFIT * spacing, 2 * _LEAST_MISFIT)):
         raise Refusal(
-            f"corners are {misfits(points, corners, size).max():.1f} px from where the target has them: the sizes stated are "
-            "not in the right ratio, it is hidden in part, or a board is not flat"
+            f"corners are {misfits(points, corners, size).max():.1f} px from where the target has them: the sizes "
+            "stated are not in the right ratio, it is hidden in part, or a board is not flat"
         )
     return np.isin(np.arange(len(ids)), kept)

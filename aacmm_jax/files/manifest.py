@@ -29,6 +29,7 @@ from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
 from .reading_sets import other_readings
 from .toml import read_toml
+from .urdf import joint_names
 
 _QUIETLY = Detecting()
 
@@ -82,7 +83,8 @@ def _read(path: str | os.PathLike, detecting: Detecting = _QUIETLY) -> tuple[Rec
     with naming(path):
         arm = arm_beside(path.parent, model.arm)
         nominal, proposed = read_arm(arm, base=model.base, tip=model.tip, probe=model.probe)
-        readings = Readings(nominal.arm, model.angles)
+        names = () if nominal.urdf is None else joint_names(nominal.urdf)
+        readings = Readings(nominal.arm, model.angles, names)
         source = Source(manifest, "q", readings)
         sockets, lengths, spheres = _read_recorded(model, source)
         observed: list[tuple[str, Any]] = [(seat.session, seat) for seat in sockets.values() if not seat.target]

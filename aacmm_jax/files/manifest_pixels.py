@@ -2,6 +2,7 @@
 
 import base64
 import glob
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -28,6 +29,7 @@ from .outputs import write_atomically
 from .patterns import fill
 from .text_table import TextTable
 
+_MISREAD = 0.05  # of the distance between corners, from where the target has them
 _FEWEST = 4  # corners of an image that determine the pose of a board
 Progress = Callable[[Sequence[Any], str], Iterable[Any]]  # shows how many of the items are done
 
@@ -175,8 +177,9 @@ def observations_of(
             used = [i for i, image in enumerate(images) if not image.refused]
             _check_once(q, images, used)
             if not used:
-                reasons = list(dict.fromkeys(f"{quoted(image.label)}: {image.refused}" for image in images))
-                raise InputError(f"no image can be used: {shorten(reasons, 3)}.")
+                alike = {re.sub(r"[\d.]+", "", image.refused): image for image in reversed(images)}
+                reasons = [f"{quoted(image.label)}: {image.refused}" for image in reversed(alike.values())]
+                raise InputError(f"no image of {len(images)} can be used: {'; '.join(reasons[:3])}.")
             observed.append((part.session, _pixels(name, entry, camera, target, q[used], [images[i] for i in used])))
     named_images = {image.image for image in read}
     others = [image for image in seen if image.label not in named_images]
@@ -215,7 +218,11 @@ def _detected(
         raise InputError(f"no image matches '{pattern}' in {source.folder}; check the path.")
     seen = []
     for name in detecting.progress(names, "Detecting corners"):
-        image = read_image(source.open(name))
+        try:
+            image = read_image(source.open(name))
+        except InputError as error:  # one of many
+            seen.append(Seen(name, *NO_CORNERS, str(error).rpartition(f"{name} ")[2].partition(";")[0]))
+            continue
         found = detect(image, target, image_size=size)
         if detecting.overlays is not None:
             detecting.overlays.mkdir(parents=True, exist_ok=True)
@@ -244,7 +251,28 @@ def _checked(image: Seen, camera: Camera, target: AbstractTarget) -> Seen:
         )
     if not image.refused and len(ids) < _FEWEST:
         return image._replace(refused=f"only {len(ids)} corners were found; at least {_FEWEST} are needed")
-    return image
+    if image.refused or image.size is not None or image.corners.shape[1] != 2:  # detected corners were checked
+        return image
+    return image._replace(refused=_misread(image, camera, target))
+
+
+def _misread(image: Seen, camera: Camera, target: AbstractTarget) -> str:
+    """Why corners that somebody detected cannot be those of the target; nothing if they can."""
+    from ..camera.consistency import is_mirrored, misfits
+    from ..camera.evidence import points_of
+
+    points, corners = points_of(target, image.ids), image.corners
+    size = corners.max(axis=0) + 1 if camera.image_size is None else np.asarray(camera.image_size)
+    apart = np.linalg.norm(corners[:, None] - corners, axis=2) + np.diag(np.full(len(corners), np.inf))
+    misfit = float(np.median(misfits(points, corners, tuple(size.tolist()))))
+    if misfit > _MISREAD * float(np.median(apart.min(axis=1))):
+        return (
+            f"its corners are {misfit:.1f} px from where the target has them: it is another target, its rows and "
+            "columns are exchanged, or the ids are in another order"
+        )
+    if target.kind in ("charuco", "tags") and not np.ptp(points[:, 2]) and is_mirrored(points[:, :2], corners):
+        return "its corners are those of a mirrored target: the image or the print is mirrored, or v points up"
+    return ""
 
 
 def _check_once(q: Float[np.ndarray, "m n"], images: Sequence[Seen], used: Sequence[int]) -> None:

@@ -53,8 +53,8 @@ class Readings:
     directions, loads or temperatures and another not.
     """
 
-    def __init__(self, arm: Arm, angles: Angles | None):
-        self._arm, self._angles = arm, angles
+    def __init__(self, arm: Arm, angles: Angles | None, names: Sequence[str] = ()):
+        self._arm, self._angles, self._names = arm, angles, names  # of the joints in the arm's file
         self._first: str | os.PathLike | None = None  # the file of the first table
         self.beside: tuple[str, ...] = ()  # what the tables have beside the readings
         self.columns: list[int] = []  # of the joints in the first table, from 1
@@ -68,7 +68,7 @@ class Readings:
             stated = as_list(self._angles.columns)
         beside = {name: columns for name in COLUMNS if (columns := self._columns_of(text, name))}
         by_joint = [i for name in BY_JOINT for i in beside.get(name, [])]
-        picked = reading_columns(text, self._arm.joints, [*wanted.taken, *by_joint], stated)
+        picked = reading_columns(text, self._arm.joints, [*wanted.taken, *by_joint], stated, names=self._names)
         for name, columns in beside.items():
             if set(columns) & set(picked):
                 raise InputError(

@@ -172,6 +172,44 @@ def test_tables_that_make_no_sense_are_refused(tmp_path, seen, table, old, new, 
     assert_refused(lambda: read(tmp_path), *parts)
 
 
+@pytest.mark.parametrize(
+    ("changed", "squares", "part"),
+    [
+        (lambda u, v: (639 - u, v), [6, 5], "those of a mirrored target"),
+        (lambda u, v: (u, 479 - v), [6, 5], "v points up"),
+        (lambda u, v: (u, v), [9, 8], "another target"),
+        (lambda u, v: (u, v), [5, 6], "rows and columns are exchanged"),
+    ],
+    ids=["mirrored", "v up", "larger board", "turned board"],
+)
+def test_corners_that_cannot_be_those_of_the_target_are_refused(tmp_path, seen, changed, squares, part):
+    corners = np.asarray(seen.corners)
+    files(tmp_path, seen.changed(corners=np.stack(changed(corners[..., 0], corners[..., 1]), axis=-1)))
+    changes = [("squares = [6, 5]", f"squares = {squares}")]
+    assert_refused(lambda: read(tmp_path, changes=changes), "no image of 12", "img_0.png", part)
+
+
+def test_columns_named_as_the_joints_of_a_urdf_are_the_readings(tmp_path, seen):
+    """In any order, beside other columns of numbers; the arm of this URDF need not fit the images."""
+    names = ["pan", "lift", "elbow", "roll", "pitch", "yaw"]
+    links = "".join(f'<link name="l{i}"/>' for i in range(7))
+    joints = "".join(
+        f'<joint name="{name}" type="continuous"><parent link="l{i}"/><child link="l{i + 1}"/>'
+        f'<origin xyz="0.1 0 0.3"/><axis xyz="0 {i % 2} {1 - i % 2}"/></joint>'
+        for i, name in enumerate(names)
+    )
+    (tmp_path / "robot.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
+    files(tmp_path, seen)
+    table = (tmp_path / "joints.csv").read_text().splitlines()
+    cells = [row.split(",") for row in table[1:]]
+    header = ",".join(["image", "speed", *(f"{name} [deg]" for name in reversed(names))])
+    rows = [",".join([image, "7", *reversed(q)]) for image, *q in cells]
+    (tmp_path / "joints.csv").write_text("\n".join([header, *rows]) + "\n")
+    (tmp_path / "capture.toml").write_text('arm = "robot.urdf"\n' + TARGET + CAMERA + PIXELS)
+    recording = aj.files.read_manifest(tmp_path / "capture.toml")
+    np.testing.assert_allclose(recording.capture.observations[0].q, seen.q, atol=1e-12)
+
+
 def test_two_images_of_one_pose_are_refused(tmp_path, seen):
     files(tmp_path, seen, order=[0, *range(1, 12)])
     lines = (tmp_path / "joints.csv").read_text().splitlines()
