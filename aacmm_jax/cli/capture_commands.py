@@ -10,6 +10,7 @@ from .. import data, files, pipeline, summaries
 from ..core.errors import InputError
 from ..core.text import quoted
 from ..core.units import DEG
+from ..files.inputs import ROBOT_FILES
 from ..files.outputs import together
 from . import options, views
 from .app import command, read_with_progress, show_summary, with_spinner
@@ -97,7 +98,7 @@ def simulate(
     with together(output):
         nominal, true = files.load_specification(arm, base=base, tip=tip), None
         if true_arm:
-            true_base, true_tip = (base, tip) if true_arm.lower().endswith(".urdf") else (None, None)
+            true_base, true_tip = (base, tip) if true_arm.lower().endswith(ROBOT_FILES) else (None, None)
             true = files.load_specification(true_arm, base=true_base, tip=true_tip)
         points, form = sockets_option(socket), "T or LOWEST,HIGHEST, in C"
         warmth = None if temperature_c is None else numbers_option("--temperature-c", temperature_c, form)

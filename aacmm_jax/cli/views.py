@@ -67,7 +67,8 @@ def arm(summary: dict[str, Any]) -> View:
         if any(x != (row == column) for row, values in enumerate(frame) for column, x in enumerate(values)):
             z, origin = (", ".join(f"{values[column]:.6g}" for values in frame[:3]) for column in (2, 3))
             where = f"in a frame at ({origin}) mm in {base}, with its z axis along ({z})"
-        yield f"From a URDF, links {base} to {urdf['tip']}; positions are {where}."
+        source = "MJCF" if urdf["format"] == "MJCF" else "a URDF"
+        yield f"From {source}, links {base} to {urdf['tip']}; positions are {where}."
 
 
 def capture(summary: dict[str, Any]) -> View:

@@ -13,6 +13,7 @@ from ..core.errors import InputError
 from .outputs import as_path, reading, waiting
 
 LARGEST_FILE = "AACMM_LARGEST_FILE_MB"  # environment variable: size limit of inputs, MiB
+ROBOT_FILES = (".urdf", ".xacro", ".xml", ".mjcf")  # URDF and MJCF; xacro for the message that says how to expand it
 STREAMED = 100  # a study's file, which is read in parts, may be larger than the limit by this factor
 
 
