@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 from ..core.arguments import checked_arguments
 from ..core.errors import InputError, require
+from ..core.pictures import picture_size
 from ..core.text import pluralise
 from ..data.targets import DICTIONARIES, AbstractTarget, Charuco, Checkerboard
 from .edges import blur_of
@@ -114,7 +115,6 @@ def read_image(image: str | os.PathLike | np.ndarray) -> Grey:
             )
         return image
     require("camera", "Detection of corners in images")
-    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(_MOST_PIXELS))  # which OpenCV reads when it is imported
     import cv2
 
     content = getattr(image, "content", None)  # of a file that was read already
@@ -122,9 +122,10 @@ def read_image(image: str | os.PathLike | np.ndarray) -> Grey:
         if not os.path.isfile(image):
             raise InputError(f"{image} does not exist; give the path of an image.")
         content = Path(image).read_bytes()
-    data = np.frombuffer(content, dtype=np.uint8)
+    data, (width, height) = np.frombuffer(content, dtype=np.uint8), picture_size(content) or (0, 0)
+    readable = len(data) > 0 and width * height <= _MOST_PIXELS
     try:
-        grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
+        grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if readable else None
     except cv2.error:  # such as an image of billions of pixels
         grey = None
     if grey is None:

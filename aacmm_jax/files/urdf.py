@@ -331,7 +331,7 @@ def _joints_before(robot: Robot, link: str) -> list[UrdfJoint]:
 
 def joint_names(source: UrdfSource) -> list[str]:
     """The names of the moving joints of the chain, from the base."""
-    path = _joints_between(parse_urdf(source.text), source.base, source.tip)
+    path = _joints_between(parse_robot(source.text), source.base, source.tip)
     return [joint.name for joint in path if joint.kind != "fixed"]
 
 

@@ -73,7 +73,7 @@ def test_a_table_of_corners_is_read_and_comes_back_from_a_file(tmp_path, seen, i
     assert loaded.capture.observations[0].ids == pixels.ids
 
 
-@pytest.mark.parametrize("lists", ["all", "ids", "points", "plain"])
+@pytest.mark.parametrize("lists", ["all", "ids", "points", "plain", "records"])
 def test_nested_lists(tmp_path, seen, lists):
     files(tmp_path, seen, images=False)
     corners = np.asarray(seen.corners)[:, :, None, :].tolist()
@@ -83,6 +83,7 @@ def test_nested_lists(tmp_path, seen, lists):
         "ids": {"corners": corners, "ids": ids},
         "points": {"imgpoints": corners, "objpoints": points},
         "plain": corners,
+        "records": [{"image": f"{i}", "ids": ids[i], "image_points": corners[i]} for i in range(len(ids))],
     }[lists]
     (tmp_path / "corners.json").write_text(json.dumps(content))
     (pixels,) = read(tmp_path, changes=[("corners.csv", "corners.json")]).capture.observations
@@ -257,6 +258,20 @@ def test_corners_are_detected_once_where_readings_are_commanded_and_measured(tmp
     recording = aj.files.read_manifest(tmp_path / "webcam.toml")
     assert recording.other_readings.role == "commanded"
     assert len(recording.other_readings.capture.observations[0].q) == len(detected) == 4
+
+
+def test_a_damaged_image_and_one_of_too_many_pixels_are_not_used(tmp_path):
+    """A sentence for each; the others are used."""
+    cv2 = pytest.importorskip("cv2")
+    part_of_example(tmp_path, 5)
+    images = sorted((tmp_path / "images").iterdir())
+    images[3].write_bytes(images[3].read_bytes()[:3000])
+    bomb = cv2.imencode(".png", np.zeros((12_000, 12_000), dtype=np.uint8))[1].tobytes()
+    images[4].write_bytes(bomb)
+    recording = aj.files.read_manifest(tmp_path / "webcam.toml")
+    assert [image.corners > 0 for image in recording.images] == [True] * 3 + [False] * 2
+    for image in recording.images[3:]:
+        assert image.refused == "is not an image that OpenCV reads, is damaged, or has more than 120 million px"
 
 
 def test_images_are_read_and_drawn(tmp_path):
