@@ -56,7 +56,7 @@ def misfits(
     terms = _POWERS[: max(len(points) // _PER_TERM - 3, 0)] if flat else []
     x, y = (plane[:, :2] / sizes[0]).T
     bending = np.stack([np.ones_like(x), x, y, *(x**a * y**b for a, b in terms)], axis=1)
-    middle, reach = (np.array(size) - 1) / 2, np.hypot(*size) / 2
+    middle, reach = (np.array(size) - 1) / 2, float(np.linalg.norm(size)) / 2
     least = np.full(len(points), np.inf)
     for bent in _BENT if terms else _BENT[:1]:
         straight = _unbent((values - middle) / reach, bent)
