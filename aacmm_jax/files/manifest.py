@@ -84,17 +84,12 @@ def _read(path: str | os.PathLike, detecting: Detecting = _QUIETLY) -> tuple[Rec
     with naming(path):
         arm = arm_beside(path.parent, model.arm)
         nominal, proposed = read_arm(arm, base=model.base, tip=model.tip, probe=model.probe)
-<<<<<<< HEAD
-        names = () if nominal.urdf is None else joint_names(nominal.urdf)
-        readings = Readings(nominal.arm, model.angles, names)
-        source = Source(manifest, "q", readings)
-=======
         source = Source(manifest, "q")
         angles = model.angles
         if angles is not None and angles.calibration is not None:
             angles = angles_by_motors(angles, source.open(angles.calibration), nominal.arm.joints)
-        source.rows = readings = Readings(nominal.arm, angles)
->>>>>>> main
+        names = () if nominal.urdf is None else joint_names(nominal.urdf)
+        source.rows = readings = Readings(nominal.arm, angles, names)
         sockets, lengths, spheres = _read_recorded(model, source)
         observed: list[tuple[str, Any]] = [(seat.session, seat) for seat in sockets.values() if not seat.target]
         # Where another tip than the arm's own probe was held, it is an observation.
