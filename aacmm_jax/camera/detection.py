@@ -16,8 +16,9 @@ from ..core.errors import InputError, require
 from ..core.pictures import picture_size
 from ..core.text import pluralise
 from ..data.targets import DICTIONARIES, AbstractTarget, Charuco, Checkerboard
+from .consistency import on_one_line
 from .edges import blur_of
-from .evidence import BORDER, FEWEST, Grey, Refusal, inside, points_of, why_nothing
+from .evidence import BORDER, FEWEST, Grey, Refusal, inside, why_nothing
 from .markers import tag_corners, target_markers
 from .squares import charuco_corners, checkerboard_corners
 
@@ -200,9 +201,7 @@ def _checked_blur(
     if len(ids) < FEWEST[target.kind]:
         fewest = f"at least {FEWEST[target.kind]} are needed"
         raise Refusal(f"{pluralise(len(ids), 'corner')} found, and {fewest}{why_nothing(grey)}")
-    points = points_of(target, ids)
-    sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    if sizes[1] < 0.05 * sizes[0]:
+    if on_one_line(target.points_of(ids)):
         raise Refusal(f"the {len(ids)} corners found are on one line")
     where, found = {corner: k for k, corner in enumerate(ids.tolist())}, []
     if isinstance(target, Checkerboard | Charuco):

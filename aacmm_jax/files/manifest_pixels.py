@@ -2,7 +2,6 @@
 
 import base64
 import glob
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -10,6 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..camera.consistency import is_mirrored, misfits, on_one_line
 from ..core.errors import InputError, naming, nearest
 from ..core.text import quoted, shorten
 from ..core.units import LENGTH_UNITS
@@ -176,9 +176,11 @@ def observations_of(
             used = [i for i, image in enumerate(images) if not image.refused]
             _check_once(q, images, used)
             if not used:
-                alike = {re.sub(r"[\d.]+", "", image.refused): image for image in reversed(images)}
-                reasons = [f"{quoted(image.label)}: {image.refused}" for image in reversed(alike.values())]
-                raise InputError(f"no image of {len(images)} can be used: {'; '.join(reasons[:3])}.")
+                labels: dict[str, list[str]] = {}
+                for image in images:
+                    labels.setdefault(image.refused, []).append(quoted(image.label))
+                reasons = [f"{shorten(of_reason, 1)}: {reason}" for reason, of_reason in labels.items()]
+                raise InputError(f"no image can be used ({shorten(reasons, 3)}); take other images, or correct these.")
             observed.append((part.session, _pixels(name, entry, camera, target, q[used], [images[i] for i in used])))
     named_images = {image.image for image in read}
     others = [image for image in seen if image.label not in named_images]
@@ -252,30 +254,35 @@ def _checked(image: Seen, camera: Camera, target: AbstractTarget) -> Seen:
             f"{label} has the point id {ids[counts.argmax()]} twice; give one row for each corner, and one image for "
             "each pose."
         )
-    if not image.refused and len(ids) < _FEWEST:
-        return image._replace(refused=f"only {len(ids)} corners were found; at least {_FEWEST} are needed")
-    if image.refused or image.size is not None or image.corners.shape[1] != 2:  # detected corners were checked
-        return image
-    return image._replace(refused=_misread(image, camera, target))
+    return image._replace(refused=image.refused or _why_useless(image, camera, target))
 
 
-def _misread(image: Seen, camera: Camera, target: AbstractTarget) -> str:
-    """Why corners that somebody detected cannot be those of the target; nothing if they can."""
-    from ..camera.consistency import is_mirrored, misfits
-    from ..camera.evidence import points_of
+def _why_useless(image: Seen, camera: Camera, target: AbstractTarget) -> str:
+    """Why the corners of an image show no view of a target; empty where they do."""
+    if len(image.ids) < _FEWEST:
+        return f"only {len(image.ids)} corners were found; at least {_FEWEST} are needed"
+    points = target.points_of(image.ids)
+    if on_one_line(points):
+        return f"its {len(points)} corners are on one line"
+    if _is_misread(image, camera, points):
+        return (
+            "its corners are not where the target has them: it is another target, its rows and columns are exchanged, "
+            "or the ids are in another order"
+        )
+    if target.kind != "points" and image.corners.shape[1] == 2 and is_mirrored(points[:, :2], image.corners):
+        return "the board is seen from behind: the image is mirrored, or the ids are counted in another order"
+    return ""
 
-    points, corners = points_of(target, image.ids), image.corners
+
+def _is_misread(image: Seen, camera: Camera, points: Float[np.ndarray, "k 3"]) -> bool:
+    """Whether corners that somebody detected cannot be those of these points; those detected here were checked."""
+    if image.size is not None or image.corners.shape[1] != 2:
+        return False
+    corners = image.corners
     size = corners.max(axis=0) + 1 if camera.image_size is None else np.asarray(camera.image_size)
     apart = np.linalg.norm(corners[:, None] - corners, axis=2) + np.diag(np.full(len(corners), np.inf))
-    misfit = float(np.median(misfits(points, corners, tuple(size.tolist()))))
-    if misfit > _MISREAD * float(np.median(apart.min(axis=1))):
-        return (
-            f"its corners are {misfit:.1f} px from where the target has them: it is another target, its rows and "
-            "columns are exchanged, or the ids are in another order"
-        )
-    if target.kind in ("charuco", "tags") and not np.ptp(points[:, 2]) and is_mirrored(points[:, :2], corners):
-        return "its corners are those of a mirrored target: the image or the print is mirrored, or v points up"
-    return ""
+    misfit = np.median(misfits(points, corners, tuple(size.tolist())))
+    return bool(misfit > _MISREAD * np.median(apart.min(axis=1)))
 
 
 def _check_once(q: Float[np.ndarray, "m n"], images: Sequence[Seen], used: Sequence[int]) -> None:
