@@ -114,9 +114,10 @@ def test_rendered_images_are_read_as_they_were_simulated(aacmm, tmp_path):
     [
         (KIT, ("--blur-px", "1"), "--images FOLDER"),
         (KIT.replace("intrinsics =", "# "), (), "'webcam' has no intrinsics"),
+        (KIT.replace('"looks"', '".."'), (), "cannot be the name of a folder"),
         ('[[socket]]\nname = "cone"\npoint = [400, 200, 300]\nposes = 2\n', (), "no camera"),
     ],
-    ids=["no images", "no intrinsics", "no camera"],
+    ids=["no images", "no intrinsics", "folder above", "no camera"],
 )
 def test_images_that_cannot_be_rendered_are_refused(aacmm, tmp_path, kit, options, says):
     (tmp_path / "kit.toml").write_text(kit)
