@@ -55,8 +55,8 @@ class Readings:
     directions, loads or temperatures and another not.
     """
 
-    def __init__(self, arm: Arm, angles: Angles | None):
-        self._arm, self._angles = arm, angles
+    def __init__(self, arm: Arm, angles: Angles | None, names: Sequence[str] = ()):
+        self._arm, self._angles, self._names = arm, angles, names  # of the joints in the arm's file
         self._first: str | os.PathLike | None = None  # the file of the first table
         self.beside: tuple[str, ...] = ()  # what the tables have beside the readings
         self.columns: list[int] = []  # of the joints in the first table, from 1
@@ -74,7 +74,7 @@ class Readings:
             if not (name == "directions" and self._in_order) and (columns := self._columns_of(text, name))
         }
         of_joints = [i for name in BY_JOINT for i in beside.get(name, [])]
-        picked = reading_columns(text, self._arm.joints, [*wanted.taken, *of_joints], stated)
+        picked = reading_columns(text, self._arm.joints, [*wanted.taken, *of_joints], stated, names=self._names)
         for name, columns in beside.items():
             if set(columns) & set(picked):
                 raise InputError(
