@@ -7,8 +7,8 @@ from ..data.capture import Capture
 from ..data.observations.measured import MeasuredTransforms
 from ..data.observations.observation import offset_of
 from ..kinematics.arm import Arm, correction_names, parameter_names, probe_names, tips_of
-from ..kinematics.correction_kinds import Expansion
 from ..kinematics.parameters import Parameters
+from ..kinematics.recorded_kinds import Expansion
 from ..kinematics.robots import chains_of
 from ..model.observed import Observed
 
