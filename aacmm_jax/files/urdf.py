@@ -37,6 +37,7 @@ _REVOLUTION = (-2 * math.pi, 2 * math.pi)  # limits of a continuous joint: readi
 _LONGEST = 50_000.0  # mm; no serial chain is as long
 _LARGEST, _IN_DEGREES = 15.0, 720.0  # rad: limits of joints end below; those in degrees are mostly between
 _SAME_PLACE = 1e-9  # mm: a probe nearer to the tip link than this is no tool beyond it
+MOVING = ("revolute", "continuous", "prismatic")
 _LISTED = 12  # links that a message names
 
 
@@ -316,8 +317,12 @@ def _attributes(transform: Transform) -> dict[str, str]:
 def mimic_of(joint: UrdfJoint, robot: Robot) -> tuple[str, float, float]:
     """The joint that a joint mimics, the factor and the offset, by readings in rad and mm."""
     element = joint.element.child("mimic")
-    assert element is not None
     assert joint.mimics is not None
+    if element is None:  # an equality of MJCF, whose polynomial may be of any order
+        raise InputError(
+            f"joint {quoted(joint.name)} mimics {quoted(joint.mimics)}, which is followed only in a URDF; choose links "
+            "without this joint between them."
+        )
     factor, offset = (float(element.numbers(*of)[0]) for of in (("multiplier", (1.0,)), ("offset", (0.0,))))
     unit, followed = (1000.0 if kind == "prismatic" else 1.0 for kind in (joint.kind, robot.joints[joint.mimics].kind))
     return joint.mimics, factor * unit / followed, offset * unit
@@ -326,7 +331,7 @@ def mimic_of(joint: UrdfJoint, robot: Robot) -> tuple[str, float, float]:
 def _check_moving(joint: UrdfJoint, others: Container[str]) -> None:
     """Refuse a joint that an arm does not have; ``others`` are the joints that it may mimic."""
     what, slides = f"joint {quoted(joint.name)}", joint.kind == "prismatic"
-    if joint.kind not in ("revolute", "continuous", "prismatic"):
+    if joint.kind not in MOVING:
         of_format = joint.kind in ("floating", "planar", "spherical")
         kind = f"is {joint.kind}" if of_format else f"has the unknown type {quoted(joint.kind)}"
         raise InputError(

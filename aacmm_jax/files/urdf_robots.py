@@ -1,6 +1,7 @@
 """Robots of several chains in a URDF or MJCF: the chains from one base to several tips as one arm."""
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from ..kinematics.robots import together
 from .inputs import InputFile
 from .mjcf import with_includes
 from .mjcf_text import parse_robot
-from .urdf import UrdfChain, ends_of, joints_between, listed_links, located, mimic_of, urdf_chain
+from .urdf import MOVING, UrdfChain, ends_of, joints_between, listed_links, located, mimic_of, urdf_chain
 from .urdf_text import Robot
 
 
@@ -39,8 +40,7 @@ def read_urdf(
         chosen = tips if given else moving_tips(robot, base, tips)
         if len(chosen) < min(2, len(tips)):
             raise InputError(
-                f"the file has several links at the end of the same joints, {listed_links(tips)}; choose the tip (tip= "
-                "or --tip)."
+                f"the file has several chains, which end at {listed_links(tips)}; choose the tip (tip= or --tip)."
             )
         source = UrdfSource(text, base, "\n".join(dict.fromkeys(chosen)))
         arm = urdf_arm(source)
@@ -75,11 +75,18 @@ def urdf_arm(source: UrdfSource) -> Arm:
 
 
 def moving_tips(robot: Robot, base: str, tips: list[str]) -> list[str]:
-    """One tip for each chain of moving joints that is no beginning of another one: the one after most joints."""
-    paths = {tip: joints_between(robot, base, tip) for tip in tips}
-    moving = {tip: tuple(joint.name for joint in path if joint.kind != "fixed") for tip, path in paths.items()}
-    whole = [
-        names for names in dict.fromkeys(moving.values())
-        if not any(other != names and other[: len(names)] == names for other in moving.values())
-    ]  # fmt: skip
-    return [max((tip for tip in tips if moving[tip] == names), key=lambda tip: len(paths[tip])) for names in whole]
+    """One tip for each chain of moving joints that is no beginning of another one, the one after most joints. Chains
+    that differ in their last joint alone are the fingers of a gripper, and end before it."""
+    ends: dict[tuple[str, ...], tuple[int, str]] = {}  # by the moving joints
+    for tip in tips:
+        path = joints_between(robot, base, tip)
+        moving = tuple(joint.name for joint in path if joint.kind != "fixed")
+        if all(joint.kind in MOVING for joint in path if joint.kind != "fixed"):
+            ends[moving] = max(ends.get(moving, (0, tip)), (len(path), tip), key=lambda end: end[0])
+    before = Counter(moving[:-1] for moving in ends)
+    fingers = [moving for moving in ends if before[moving[:-1]] > 1]
+    for moving in fingers:
+        del ends[moving]
+        ends.setdefault(moving[:-1], (0, robot.joints[moving[-1]].parent))
+    inner = {moving[:count] for moving in ends for count in range(len(moving))}
+    return [tip for moving, (_, tip) in ends.items() if moving not in inner and moving]

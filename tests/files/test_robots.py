@@ -47,6 +47,17 @@ def readings(robot: aj.Arm) -> np.ndarray:
     return np.column_stack([q, np.arange(6) % len(robot.chains)])
 
 
+def test_fingers_of_grippers_are_no_chains(tmp_path):
+    fingers = "".join(
+        joint(f"{side}_finger{i}", "prismatic", f"{side}_tool", f"{side}_f{i}", "", LIMIT)
+        for side in ("left", "right")
+        for i in (1, 2)
+    )
+    path = tmp_path / "grippers.urdf"
+    path.write_text(f'<robot name="two"><link name="base"/>{LIFT}{SIDES}{fingers}</robot>')
+    assert [name for name, _ in aj.load_arm(path).chains] == ["left_tool", "right_tool"]
+
+
 def test_several_tips_are_a_robot(urdf):
     robot = aj.load_arm(urdf)
     assert [name for name, _ in robot.chains] == ["left_tool", "finger"]
