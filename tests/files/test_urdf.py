@@ -217,7 +217,9 @@ REFUSED = {
         joint("finger_1", limit='<limit lower="0.04" upper="0"/>'), {"tip": "left_finger"}, ["limits 0.04 and 0 m;"]
     ),
     "mimic": (
-        ('<mimic joint="joint_6"/>', '<mimic joint="finger_1"/>'), {"tip": "right_finger"}, ["'finger_2' mimics 'finger_1'"]
+        ('<mimic joint="joint_6"/>', '<mimic joint="finger_1"/>'),
+        {"tip": "right_finger"},
+        ["'finger_2' mimics 'finger_1'"],
     ),
     "floating": (("joint_4\" type=\"revolute", "joint_4\" type=\"floating"), {}, ["'joint_4' is floating"]),
     "planar": (("joint_4\" type=\"revolute", "joint_4\" type=\"planar"), {}, ["'joint_4' is planar"]),
