@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ..calibration.record import CalibrationRecord
+from ..calibration.reprojection import frame_of, mount_of, reprojection
 from ..core.rotations import roll_pitch_yaw, rotation_and_derivative
 from ..data.observations.observation import offset_of
 from ..data.observations.pixels import Pixels
 from ..data.recording import Recording
-from ..diagnostics.reprojection import frame_of, mount_of, reprojection
 from .tables import plain
 
 
@@ -101,8 +101,8 @@ def _intrinsics(
 ) -> list[dict[str, Any]]:
     """The intrinsics with their standard uncertainty: 0 of those that are taken as exact."""
     u = np.zeros(len(values))
-    if observation.unsure:
-        u[list(observation.unsure)] = np.sqrt(np.diag(np.asarray(covariances[observation.optics])))
+    for part, places in observation.optical.items():
+        u[list(places)] = np.sqrt(np.diag(np.asarray(covariances[part])))
     model = observation.camera_model
     return [
         {"name": name, "unit": unit, "value": float(value), "u": plain(float(own))}
