@@ -35,12 +35,12 @@ def image_rows(recording: Recording) -> list[dict[str, Any]]:
 
 def camera_rows(record: CalibrationRecord) -> list[dict[str, Any]]:
     """What each observation of a camera says: mount, place, intrinsics, reprojection; mm, rad and px, u with k = 1."""
-    rows = []
+    rows, arm = [], record.calibrated.arm
     geometry, covariances = record.observed.geometry, record.observed.geometry_covariance
     for observation in record.recording.capture.observations:
         if not isinstance(observation, Pixels):
             continue
-        seen = reprojection(record.calibrated.arm, observation, geometry)
+        seen = reprojection(arm, observation, geometry)
         moving, still = (observation.camera, observation.board)[:: 1 if observation.on_arm else -1]
         place = np.asarray(covariances[observation.frame])
         mount = _placed(
@@ -64,11 +64,20 @@ def camera_rows(record: CalibrationRecord) -> list[dict[str, Any]]:
             "reprojection_rms": seen.rms,
             "reprojection_rms_mm": float(np.sqrt(np.mean(seen.in_mm[seen.seen] ** 2))),
             "distance_mm": float(np.median(seen.distance[seen.seen])),
-            "mount": {"of": moving, "in": "last frame"} | mount,
-            "place": {"of": still, "in": "base"} | _placed(frame_of(frame), frame[:3], place[3:, 3:], place[:3, :3]),
+            "mount": {"of": moving, "in": "last frame", "defined_by": _held_of(record, arm.joints)} | mount,
+            "place": {"of": still, "in": "base", "defined_by": _held_of(record, 1)}
+            | _placed(frame_of(frame), frame[:3], place[3:, 3:], place[:3, :3]),
+            "tip_seen": any(not part.target for part in record.recording.capture.parts),
             "intrinsics": _intrinsics(observation, seen.intrinsics, covariances),
         })  # fmt: skip
     return rows
+
+
+def _held_of(record: CalibrationRecord, joint: int) -> list[str]:
+    """The held parameters of the first or the last joint that move what is seen from there as a whole. None of an arm
+    that is held altogether, whose errors U contains as far as residuals show them."""
+    names = (f"theta_{joint}", f"d_{joint}")
+    return [name for name in names if record.names and name not in record.names]
 
 
 def _placed(

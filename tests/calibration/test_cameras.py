@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.calibration.redrawn import truth_of
 from aacmm_jax.calibration.reprojection import reprojection
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.data.cameras.views import calibrated_camera, started_intrinsics
@@ -246,3 +247,22 @@ def test_bad_cameras(fields, message):
     stored = {name: value for name, value in stored.items() if name != "u_intrinsics"}
     with pytest.raises(aj.InputError, match=message):
         kinds.Pixels.rebuilt("eye", stored)
+
+
+@pytest.mark.slow
+def test_trials_drawn_anew_scatter_as_the_covariance_says():
+    """With stated, free and exact intrinsics and an uncertain scale, which a batch has as parts of its own too."""
+    options = {"u_intrinsics": (1.0, 1.0, np.inf, np.inf, 0.01, 0.0, 0.0, 0.0, 0.0), "u_scale": 1e-4}
+    capture = aj.simulate(TRUE, {}, observations=[seen(**options)], noise=NOISE, seed=2)
+    space = aj.Parameters(TRUE, ("theta_2", "theta_3", "a_2"))
+    bounds = aj.Bounds.around(TRUE, space)
+    result = aj.calibrate(TRUE, capture, bounds, noise=NOISE, undetermined="ignore")
+    drawn, _ = truth_of(result, capture).drawn(200, NOISE, np.random.default_rng(0))
+    many = aj.calibrate_many(result.arm, drawn, bounds, noise=NOISE)
+    u = np.sqrt(np.diag(result.covariance))
+    error = np.asarray(many.parameters) - np.asarray(result.parameters)
+    np.testing.assert_allclose(error.std(axis=0), u, rtol=0.2)
+    assert np.all(np.abs(error.mean(axis=0)) < 4 * u / np.sqrt(200))
+    # Of poses drawn with replacement.
+    sampled = aj.bootstrap(result, capture, trials=100)
+    np.testing.assert_allclose(sampled.u[:3], u, rtol=0.6)

@@ -69,6 +69,22 @@ def test_a_table_of_corners_is_read_and_comes_back_from_a_file(tmp_path, seen, i
     assert loaded.capture.observations[0].ids == pixels.ids
 
 
+def test_a_column_divides_the_images_into_groups(tmp_path, seen):
+    """Observations of one camera and one target, which can be held out by name."""
+    files(tmp_path, seen)
+    lines = (tmp_path / "joints.csv").read_text().splitlines()
+    places = ["place", *("left" if i % 3 else "right" for i in range(12))]
+    (tmp_path / "joints.csv").write_text("\n".join(f"{a},{b}" for a, b in zip(lines, places, strict=True)))
+    recording = read(tmp_path, changes=[('corners = "corners.csv"\n', 'corners = "corners.csv"\ngroup = "place"\n')])
+    right, left = recording.capture.observations
+    assert [part.name for part in (right, left)] == ["webcam/right", "webcam/left"]
+    assert (right.camera, right.board) == (left.camera, left.board) == ("webcam", "board")
+    np.testing.assert_allclose(right.corners, np.asarray(seen.corners)[::3], atol=1e-6)
+    assert [image.observation for image in recording.images].count("webcam/left") == 8
+    held_out = aj.calibrate_capture(recording, hold_out="webcam/right", cross_validate=False).held_out
+    assert held_out.observation == ("webcam/right",) * 4
+
+
 @pytest.mark.parametrize("lists", ["all", "ids", "points", "plain"])
 def test_nested_lists(tmp_path, seen, lists):
     files(tmp_path, seen, images=False)

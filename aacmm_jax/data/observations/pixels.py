@@ -63,10 +63,11 @@ class Pixels(AbstractObservation):
     kind, table, rotates, reduces = "pixels", "pixels", True, True
     stacks, eliminates = False, False
     fixes_scale = True
-    derived = ("still", "uncertain", "free")
+    derived = ("still", "uncertain", "free", "scaled")
     still: str  # what is not on the arm
     uncertain: tuple[int, ...]  # which intrinsics have an uncertainty
     free: tuple[int, ...]  # and which are only a start
+    scaled: bool  # whether the target's scale is uncertain
     corners: Float[AnyArray, "m c d"] = declared(
         "measured corner", "px", "pose", "corner", "image_axis", more="mm of a camera that measures points in space"
     )
@@ -132,6 +133,7 @@ class Pixels(AbstractObservation):
             "target": target,
             "still": still,
             "uncertain": tuple(np.flatnonzero(unsure & known).tolist()),
+            "scaled": not is_exact(self.u_scale),
             "free": tuple(np.flatnonzero(unsure & ~known).tolist()),
         }
         if is_concrete(fields["corners"], fields["points"], fields["u"], self.intrinsics, u):
@@ -218,9 +220,7 @@ class Pixels(AbstractObservation):
 
     @property
     def row_units(self) -> tuple[str, ...]:
-        own = (
-            len(self.uncertain) + len(self.free) + (not is_exact(self.u_scale))
-        )  # that do not move the target as a whole
+        own = len(self.uncertain) + len(self.free) + self.scaled  # that do not move the target as a whole
         return (self.camera_model.unit,) * (7 + own)
 
     @property
@@ -235,7 +235,7 @@ class Pixels(AbstractObservation):
 
     @property
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
-        scale = {} if is_exact(self.u_scale) else {self.scale: ("1",)}
+        scale = {self.scale: ("1",)} if self.scaled else {}
         frames = {self.frame: FRAME, self.orientation: FRAME[:3]}
         return frames | self._by_part(self.camera_model.units) | scale
 
@@ -253,7 +253,7 @@ class Pixels(AbstractObservation):
         if self.uncertain:
             index = np.array(self.uncertain)
             values[self.optics] = (self.intrinsics[index], self.u_intrinsics[index])
-        if not is_exact(self.u_scale):
+        if self.scaled:
             values[self.scale] = (np.ones(1), namespace(self.u_scale).reshape(self.u_scale, (1,)))
         return values
 
