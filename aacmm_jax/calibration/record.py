@@ -370,10 +370,7 @@ def function_of_joint(
     reading = np.linspace(max(travel.min() - beyond, low), min(travel.max() + beyond, high), _POINTS)
     rows = np.zeros((_POINTS, q.shape[1]))
     rows[:, joint - 1] = reading
-    values = [
-        function_values(arm.corrections.nominal, list(chosen.values()), poses, np.asarray(arm.gravity))
-        for poses in (q, rows)
-    ]
+    values = [function_values(arm, list(chosen.values()), poses) for poses in (q, rows)]
     at_poses, functions = (value - values[0].mean(axis=1, keepdims=True) for value in values)
     slopes = np.zeros((_POINTS, len(record.names)))
     for term, function in zip(chosen.values(), functions, strict=True):

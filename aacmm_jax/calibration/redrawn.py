@@ -75,7 +75,7 @@ def functions_of(
     wider: Arm = to_numpy(with_further_corrections(arm, names))
     assert wider.corrections is not None
     terms = [term for name in names if (term := term_of(name, arm.joints)) is not None]
-    values = function_values(wider.corrections.nominal, terms, q, np.asarray(wider.gravity)).T
+    values = function_values(wider, terms, q).T
     return values, np.array([term.joint - 1 for term in terms])
 
 

@@ -7,6 +7,7 @@ off by a good part of a square, which no smooth bending explains.
 import numpy as np
 from jaxtyping import Float
 
+_WIDTH = 0.05  # of a line, over its length
 _PER_TERM = 3  # corners for each term of the bending
 _POWERS = [(1, 1), (2, 0), (0, 2), (2, 1), (1, 2), (3, 0), (0, 3)]  # of x and y
 
@@ -36,6 +37,12 @@ def projected(matrix: Float[np.ndarray, "3 e"], points: Float[np.ndarray, "k d"]
 def is_mirrored(points: Float[np.ndarray, "k 2"], values: Float[np.ndarray, "k 2"]) -> bool:
     """Whether a board appears as in a mirror: a turn from x to y runs the other way."""
     return bool(np.linalg.det(projection(points, values)) < 0)
+
+
+def on_one_line(points: Float[np.ndarray, "k d"]) -> bool:
+    """Whether points are on a line, or nearly so."""
+    sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(len(sizes) < 2 or sizes[1] < _WIDTH * sizes[0])
 
 
 def misfits(points: Float[np.ndarray, "k 3"], values: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, " k"]:

@@ -15,13 +15,15 @@ from ..core.arguments import checked_arguments
 from ..core.errors import InputError, require
 from ..core.text import pluralise
 from ..data.targets import DICTIONARIES, AbstractTarget, Charuco, Checkerboard
+from .consistency import on_one_line
 from .edges import blur_of
-from .evidence import BORDER, FEWEST, Grey, Refusal, inside, points_of, why_nothing
+from .evidence import BORDER, FEWEST, Grey, Refusal, inside, why_nothing
 from .markers import tag_corners, target_markers
 from .squares import charuco_corners, checkerboard_corners
 
 _BLURRED = 0.12  # the most blur, of the distance between neighbouring corners
 _WIDEST, _MOST_BLUR = 7.0, 3.0  # px: the width across edges in which blur is measured, and the most of it
+_PREVIEW = 320  # px: the larger side of a picture for a report
 _MOVED = 1.6  # the blur in one direction, divided by that in the other
 
 
@@ -111,6 +113,7 @@ def read_image(image: str | os.PathLike | np.ndarray) -> Grey:
                 "width) of type uint8."
             )
         return image
+    require("camera", "Detection of corners in images")
     import cv2
 
     content = getattr(image, "content", None)  # of a file that was read already
@@ -152,10 +155,8 @@ def overlay(image: str | os.PathLike | np.ndarray, detection: Detection, *, long
     require("camera", "A picture of detected corners")
     import cv2
 
-    grey = read_image(image)
-    scale = min(longest / max(grey.shape), 1.0)
-    size = (round(grey.shape[1] * scale), round(grey.shape[0] * scale))
-    picture = cv2.cvtColor(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
+    small, scale = _reduced(read_image(image), longest)
+    picture = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
     places = (detection.corners + 0.5) * scale - 0.5
     for number, (x, y) in enumerate(places):
         green = 255 * number // max(len(places) - 1, 1)  # from the first corner, red, to the last one, green
@@ -163,7 +164,28 @@ def overlay(image: str | os.PathLike | np.ndarray, detection: Detection, *, long
     if detection.refused:
         for colour, thickness in (((0, 0, 0), 3), ((80, 80, 255), 1)):
             cv2.putText(picture, detection.refused[:90], (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thickness)
-    return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
+    return jpeg(picture, 80)
+
+
+def preview(image: str | os.PathLike | np.ndarray) -> bytes:
+    """A small picture of an image, grey levels (JPEG), for a report."""
+    return jpeg(_reduced(read_image(image), _PREVIEW)[0], 60)
+
+
+def _reduced(grey: Grey, longest: int) -> tuple[np.ndarray, float]:
+    """An image whose larger side has at most so many px, and its scale."""
+    import cv2
+
+    scale = min(longest / max(grey.shape), 1.0)
+    size = [max(round(side * scale), 1) for side in grey.shape[::-1]]
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA)), scale
+
+
+def jpeg(picture: np.ndarray, quality: int) -> bytes:
+    """A picture as the content of a JPEG file; quality from 0 to 100."""
+    import cv2
+
+    return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def _checked_blur(
@@ -173,9 +195,7 @@ def _checked_blur(
     if len(ids) < FEWEST[target.kind]:
         fewest = f"at least {FEWEST[target.kind]} are needed"
         raise Refusal(f"{pluralise(len(ids), 'corner')} found, and {fewest}{why_nothing(grey)}")
-    points = points_of(target, ids)
-    sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    if sizes[1] < 0.05 * sizes[0]:
+    if on_one_line(target.points_of(ids)):
         raise Refusal(f"the {len(ids)} corners found are on one line")
     where, found = {corner: k for k, corner in enumerate(ids.tolist())}, []
     if isinstance(target, Checkerboard | Charuco):

@@ -50,12 +50,6 @@ def inside(grey: Grey, places: Float[np.ndarray, "k 2"], border: float) -> np.nd
     return np.all((places > border) & (places < np.array(grey.shape[::-1]) - 1 - border), axis=1)
 
 
-def points_of(target: AbstractTarget, ids: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k 3"]:
-    """Nominal coordinates of corners, mm."""
-    order = np.argsort(target.ids)
-    return target.nominal[1][order[np.searchsorted(target.ids[order], ids)]]
-
-
 def fitting(
     target: AbstractTarget, ids: Int[np.ndarray, " k"], corners: Float[np.ndarray, "k 2"], spacing: float
 ) -> Bool[np.ndarray, " k"]:
@@ -63,7 +57,7 @@ def fitting(
 
     Refuses the image where many are not, though their order is right.
     """
-    points, kept = points_of(target, ids), np.arange(len(ids))
+    points, kept = target.points_of(ids), np.arange(len(ids))
     while len(kept):
         misfit = misfits(points[kept], corners[kept])
         worst = misfit.max()

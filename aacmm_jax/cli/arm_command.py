@@ -29,7 +29,7 @@ _CAPTURES = (".toml", ".h5")  # others are tables
 )
 def arm(
     file: str | None = argument(
-        "A TOML file, a URDF, a kinematics.yaml, or the name of an arm that ships with aacmm.", "ARM", None
+        "A TOML file, a URDF, MJCF (.xml), a kinematics.yaml, or the name of an arm that ships with aacmm.", "ARM", None
     ),
     new: Path | None = option(
         "Write a template arm file in which every key is explained. An existing file is never replaced.", "FILE.toml"
@@ -58,7 +58,7 @@ def arm(
     base: str | None = options.BASE_LINK,
     tip: str | None = options.TIP_LINK,
     probe: str | None = option(
-        "Position (mm) of the tool tip in the frame of the last link, for a URDF or kinematics.yaml.", "X,Y,Z"
+        "Position (mm) of the tool tip in the frame of the last link, for a URDF, MJCF or kinematics.yaml.", "X,Y,Z"
     ),
     as_json: bool = options.JSON,
 ) -> None:

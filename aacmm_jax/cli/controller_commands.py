@@ -18,9 +18,11 @@ from .app import command, show_summary, warn_of_unusable
 from .arm_command import first_frame
 from .options import argument, flag, names_option, numbers_option, option, output
 
-_FORMATS = {".urdf": "urdf", ".json": "json", ".csv": "csv", ".yaml": "ur", ".yml": "ur", ".py": "python"}
+_ROBOTS = ("urdf", "mjcf")
+_FORMATS = {".urdf": "urdf", ".xml": "mjcf", ".json": "json", ".csv": "csv", ".py": "python"}
+_FORMATS |= dict.fromkeys((".yaml", ".yml"), "ur")
 _OF_CAMERA = ("camera-info", "joint-origin", "static-transform", "opencv", "matrix")
-_OF_ONE_ARM = ("toml", "urdf", "table", "ur", "python")
+_OF_ONE_ARM = ("toml", *_ROBOTS, "table", "ur", "python")
 
 
 @command(
@@ -39,6 +41,7 @@ def export(
         "csv",
         "dcc",
         "urdf",
+        "mjcf",
         "table",
         "offsets",
         "ur",
@@ -50,17 +53,18 @@ def export(
         "matrix",
     ]
     | None = option(
-        "toml: arm file; json: complete summary; csv: parameters; dcc: Digital Calibration Certificate (XML); urdf: "
-        "the URDF of the nominal arm, with calibrated origins; table: D-H table (CSV); offsets: refitted zero offsets "
-        "of the joints only; ur: kinematics.yaml of Universal Robots; python: a program that needs only NumPy; "
+        "toml: arm file; json: complete summary; csv: parameters; dcc: Digital Calibration Certificate (XML); urdf, "
+        "mjcf: the URDF or MJCF of the nominal arm, with calibrated origins; table: D-H table (CSV); offsets: "
+        "refitted zero offsets of the joints only; ur: kinematics.yaml of Universal Robots; python: a program that "
+        "needs only NumPy; "
         "camera-info: intrinsics of a camera (ROS, YAML); joint-origin, static-transform, opencv, matrix: frame of a "
         "camera or target, as the fixed joint of a URDF, a command of ROS 2, YAML of OpenCV, or 4 x 4 matrix (mm). "
-        "Default: the format of the output's extension (.urdf, .json, .csv, .yaml, .py), otherwise toml.",
+        "Default: the format of the output's extension (.urdf, .xml, .json, .csv, .yaml, .py), otherwise toml.",
         "FORMAT",
         "--format",
     ),
     which: Literal["calibrated", "nominal", "true"] | None = option(
-        "Arm to write with --format toml, urdf, table, ur or python. Only a simulation has a true arm. Default: "
+        "Arm to write with --format toml, urdf, mjcf, table, ur or python. Only a simulation has a true arm. Default: "
         "calibrated.",
         None,
         "--arm",
@@ -121,12 +125,12 @@ def export(
             notes = _left_out_of_table(record, specification.arm)
         elif written_as in _OF_CAMERA:
             text = _of_camera(record, written_as, camera, frame or "mount")
-        elif written_as == "urdf":
-            text, notes = _urdf(record, specification)
+        elif written_as in _ROBOTS:
+            text, notes = _urdf(record, specification, written_as)
         else:
             text = _text(record, specification, written_as, which in (None, "calibrated"))
         if output is not None:
-            if written_as == "urdf" and nominal.urdf and text != nominal.urdf.text:
+            if written_as in _ROBOTS and nominal.urdf and text != nominal.urdf.text:
                 check_kept(output, nominal.urdf.text)
             write_text(output, text)
     typer.echo(text, nl=False) if output is None else typer.echo(f"Written: {output}")
@@ -168,25 +172,20 @@ def _of_camera(record: Any, form: str, named: str | None, frame: str) -> str:
         if not rows:
             raise InputError(f"the calibration has no camera; choose another format than {form}.")
         raise InputError(f"choose one camera with --camera: {known}.")
-    row, nominal = chosen[0], record.recording.nominal
+    row = chosen[0]
     if form == "camera-info":
         values = np.array([number["value"] for number in row["intrinsics"]])
         size = row["image_size_px"] and (int(row["image_size_px"][0]), int(row["image_size_px"][1]))
         return camera_files.camera_info_yaml(row["camera"], camera_files.StoredCamera(row["model"], values, size))
-    part, parent = row[frame], "flange" if frame == "mount" else "base"
-    matrix = np.array(part["matrix_mm"])
-    if nominal.urdf is not None and frame == "mount":
-        parent = nominal.urdf.tip
-        matrix[:3, 3] -= np.asarray(nominal.arm.probe)  # the last frame is turned as the tip link
-    elif nominal.urdf is not None:
-        parent, matrix = nominal.urdf.base, first_frame(nominal) @ matrix
+    part = row[frame]
+    parent = "flange" if part["in"] == "last frame" else part["in"]
     write = {
         "joint-origin": camera_files.joint_origin,
         "static-transform": camera_files.static_transform,
         "opencv": camera_files.transform_storage,
         "matrix": camera_files.matrix_text,
     }
-    return write[form](parent, part["of"], matrix)
+    return write[form](parent, part["of"], np.array(part["matrix_mm"]))
 
 
 def _left_out_of_table(record: Any, arm: Any) -> list[str]:
@@ -204,12 +203,17 @@ def _left_out_of_table(record: Any, arm: Any) -> list[str]:
     ]
 
 
-def _urdf(record: Any, specification: Any) -> tuple[str, list[str]]:
-    result = files.urdf_of(specification.arm, record.recording.nominal)
+def _urdf(record: Any, specification: Any, form: str) -> tuple[str, list[str]]:
+    nominal = record.recording.nominal
+    if nominal.urdf is not None and nominal.urdf.format.lower() != form:
+        raise InputError(
+            f"the nominal arm was read from {nominal.urdf.format}; choose --format {nominal.urdf.format.lower()}."
+        )
+    result, what = files.urdf_of(specification.arm, nominal), "Joints" if form == "urdf" else "Bodies, joints and sites"
     if not result.changed and not result.notes:
         return result.text, ["No origin changed."]
     return result.text, [
-        f"Joints whose origin changed: {shorten(result.changed, 12) or 'none'}.",
+        f"{what} whose origin changed: {shorten(result.changed, 12) or 'none'}.",
         *(note[0].upper() + note[1:] for note in result.notes),
         "Left unchanged as far as possible, because measurements of the tip do not determine them: the base, and the "
         "position of each frame along its joint axis and its angle about this axis.",
@@ -341,12 +345,13 @@ def correct(
 def _at_temperature(commanded: Any, calibrated: Any, temperature: float | None) -> np.ndarray:
     """The readings, with the temperature of an arm that expands."""
     from ..data.capture_data import check_temperatures
-    from ..files.manifest_readings import with_temperature
+    from ..files.manifest_readings import stated_or_recorded
+    from ..files.table_columns import TEMPERATURE
     from ..kinematics.arm import correction_names
     from ..kinematics.corrected_arm import loads_of
     from ..kinematics.correction_kinds import Expansion
 
-    torques = calibrated.corrections is not None and calibrated.corrections.functions.by_torque
+    torques = calibrated.corrections is not None and "torques" in calibrated.corrections.functions.columns
     if torques and loads_of(calibrated) is None:
         raise InputError(
             "the arm was calibrated with measured torques, but those of commanded poses are unknown without masses; "
@@ -361,9 +366,11 @@ def _at_temperature(commanded: Any, calibrated: Any, temperature: float | None) 
             "the arm was calibrated with its thermal expansion; give --temperature, or a column temperature_C."
         )
     table = str(commanded.table.path)
-    q = with_temperature(commanded.q, commanded.temperature, temperature, table)
-    check_temperatures("--temperature" if commanded.temperature is None else table, q[:, calibrated.joints :])
-    return q
+    column = None if commanded.temperature is None else commanded.temperature[:, None]
+    recorded = stated_or_recorded(temperature, column, TEMPERATURE, table, len(commanded.q))
+    assert recorded is not None
+    check_temperatures("--temperature" if commanded.temperature is None else table, recorded)
+    return calibrated.beside.laid_out(np.hstack([commanded.q, recorded]), ("thermometer",))
 
 
 def in_first_frame(record: Any, poses: np.ndarray) -> np.ndarray:

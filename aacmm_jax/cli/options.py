@@ -47,12 +47,13 @@ ONLY = option("Use only the sockets whose names match this shell pattern; may be
 WITHOUT = option("Leave out the sockets whose names match this shell pattern; may be given several times.", "PATTERN")
 CALIBRATION_FILE = argument("Calibration, written by aacmm calibrate.", "CALIBRATION.h5")
 NOMINAL_ARM = argument(
-    "Nominal arm: a TOML file, a URDF, a kinematics.yaml, or the name of an arm that ships with aacmm.", "ARM"
+    "Nominal arm: a TOML file, URDF, MJCF (.xml), kinematics.yaml, or the name of an arm that ships with aacmm.",
+    "ARM",
 )
 ABOUT = option("Administrative data of a certificate: laboratory, customer, item, persons, dates.", "FILE.toml")
-BASE_LINK = option("Fixed base link of the arm, for a URDF. Default: the root link of the URDF.", "LINK", "--base")
+BASE_LINK = option("Fixed base link of the arm, of a URDF or MJCF. Default: the root (MJCF: world).", "LINK", "--base")
 TIP_LINK = option(
-    "Last link of the arm, for a URDF. Default: the only link of the URDF without a child link.", "LINK", "--tip"
+    "Last link (MJCF: body or site) of the arm. Default: the only link or body without a child.", "LINK", "--tip"
 )
 _ENCODER = "the standard deviation of a joint reading"
 _SEATING = "the standard deviation of the tip in its socket, for each coordinate"

@@ -13,6 +13,7 @@ from .. import files, kinematics, planning, summaries
 from ..core.errors import InputError
 from ..core.text import listed, number
 from ..core.units import DEG
+from ..files.inputs import ROBOT_FILES
 from ..files.outputs import together, write_text
 from . import options
 from .app import command, progress_bar, show_summary, with_spinner
@@ -194,7 +195,7 @@ def plan(
         write_text(output, plan_csv(planned, angles))
         if manifest is not None:
             # A manifest names the links with the arm; an arm file (TOML) names those of its URDF itself.
-            urdf = specification.urdf if arm.lower().endswith(".urdf") else None
+            urdf = specification.urdf if arm.lower().endswith(ROBOT_FILES) else None
             targets = () if kit is None else target_tables(kit)
             write_text(manifest, plan_manifest(planned, arm_for(manifest, arm), urdf, angles, targets))
     written = f"{output}" if manifest is None else f"{output}, {manifest}"

@@ -10,7 +10,7 @@ from .. import acceptance as acceptance_tests
 from .. import files, pipeline, plot, summaries
 from ..core.errors import InputError
 from ..files.hdf5 import read_summary
-from ..files.inputs import InputFile, fingerprint
+from ..files.inputs import ROBOT_FILES, InputFile, fingerprint
 from ..files.outputs import together
 from ..files.stored_checks import check_shown
 from . import options, views
@@ -18,7 +18,7 @@ from .app import command, prepare_jax, show_summary, with_spinner
 from .arm_command import first_frame
 from .options import argument, option, output
 
-_ARM_SUFFIXES = ("", ".toml", ".urdf", ".xacro", ".yaml", ".yml")
+_ARM_SUFFIXES = ("", ".toml", *ROBOT_FILES, ".yaml", ".yml")
 # What reads each kind of file, what makes its summary, and what people see of it.
 _KINDS = {
     "capture": ("load_capture", "calibration.capture_summary", views.capture),
@@ -185,7 +185,7 @@ def report(
 def show(
     file: str = argument(
         "File to show: a capture, calibration, evaluation, study, model comparison or comparison of calibrations "
-        "(HDF5), or an arm (TOML file, URDF, kinematics.yaml, or the name of an arm that ships with aacmm).",
+        "(HDF5), or an arm (TOML file, URDF, MJCF, kinematics.yaml, or the name of an arm that ships with aacmm).",
         "FILE",
     ),
     cell: int | None = option("Show all results of this cell of a study.", "N", min=1),
@@ -206,7 +206,7 @@ def show(
         return
     if base is not None or tip is not None:
         raise InputError(
-            f"--base and --tip name links of a URDF, but {file} is not a URDF; leave out --base and --tip."
+            f"--base and --tip name links of a URDF or MJCF, but {file} is neither; leave out --base and --tip."
         )
     attributes, summary = read_summary(path, (*_KINDS, "study", *_COMPARISONS))
     kind = attributes["kind"]

@@ -67,7 +67,8 @@ def arm(summary: dict[str, Any]) -> View:
         if any(x != (row == column) for row, values in enumerate(frame) for column, x in enumerate(values)):
             z, origin = (", ".join(f"{values[column]:.6g}" for values in frame[:3]) for column in (2, 3))
             where = f"in a frame at ({origin}) mm in {base}, with its z axis along ({z})"
-        yield f"From a URDF, links {base} to {urdf['tip']}; positions are {where}."
+        source = "MJCF" if urdf["format"] == "MJCF" else "a URDF"
+        yield f"From {source}, links {base} to {urdf['tip']}; positions are {where}."
 
 
 def capture(summary: dict[str, Any]) -> View:
@@ -94,6 +95,7 @@ def capture(summary: dict[str, Any]) -> View:
         if stated:
             yield f"{row['observation']}: {shorten(stated, _MOST_PARTS)}."
     yield from images_words(summary.get("images") or ())
+    yield from (f"{note}." for note in summary.get("notes") or ())
     slides = any("lowest_mm" in row for row in summary["ranges"])
 
     def reading(row: dict[str, Any], end: str) -> Any:
@@ -106,6 +108,9 @@ def capture(summary: dict[str, Any]) -> View:
     if summary["largest_torques_Nm"] is not None:
         torques = ", ".join(f"{torque:.3g}" for torque in summary["largest_torques_Nm"])
         yield f"Largest torques of the joints: {torques} N m."
+    if summary["load_kg"] is not None:
+        low, high = summary["load_kg"]
+        yield f"Load at the tip: {low:.3g} to {high:.3g} kg."
     if summary["temperature_C"] is not None:
         low, high = summary["temperature_C"]
         yield f"Temperature: {low:.2f} to {high:.2f} C."

@@ -17,14 +17,13 @@ from ..core.numpy_or_jax import AnyArray, namespace
 from ..core.random_keys import random_generator
 from ..core.text import shorten
 from ..kinematics.arm import Arm
-from ..kinematics.chain import beside_joints
 from .capture_data import (
     NOTHING_REPEATED,
     UNKNOWN,
     ReferenceLength,
     Repeated,
+    check_beside,
     check_revolutions,
-    check_temperatures,
     checked_parts,
     described,
     different_lengths,
@@ -50,8 +49,8 @@ class Capture(eqx.Module):
 
     Args:
         sockets: Socket name -> joint readings, shape ``(m, n)``, rad, or mm of prismatic joints; m poses may differ
-            from socket to socket. Of an arm with a thermometer ``(m, n + 1)``, with the temperature last, C; likewise
-            in observations.
+            from socket to socket. What is recorded beside them follows in more columns (torques, directions, load,
+            temperature; see `Arm`); likewise in observations.
         lengths: Reference lengths between these sockets, or one.
         observations: What else ties the tip down (`data.observations`): measured points, spheres, planes, artefacts.
         repeated: Copies that were left out of these data before.
@@ -126,7 +125,7 @@ class Capture(eqx.Module):
 
     @property
     def columns(self) -> int:
-        """Number of columns of the readings: one a joint, and one more of an arm with a thermometer."""
+        """Number of columns of the readings: one a joint, and those of what was recorded beside them."""
         return self.q.shape[-1]
 
     @property
@@ -340,6 +339,5 @@ def check_readings(capture: Capture, arm: Arm, *, advice: str = "convert with nu
     """Raise `InputError` where known readings of an arm's revolute joints look like degrees, with advice on them."""
     for part in capture.parts:
         if is_concrete(part.q) and part.q.shape[-1] in arm.possible_columns:
-            temperature = beside_joints(arm.joints, part.q.shape[-1])[1]
-            check_temperatures(described(part), np.asarray(part.q)[..., temperature])
+            check_beside(described(part), np.asarray(part.q), arm)
             check_revolutions(described(part), part.q, arm, advice)

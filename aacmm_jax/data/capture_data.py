@@ -158,7 +158,7 @@ def checked_parts(sockets: Mapping[str, Numbers], observations: Any) -> tuple[Ab
         if part.q.shape[-1] != width:
             raise InputError(
                 f"{described(part)} has {part.q.shape[-1]} columns, but {described(parts[0])} has {width}; give one "
-                "column per joint, and the temperature as last column either everywhere or nowhere."
+                "column per joint, and what is recorded beside them either everywhere or nowhere."
             )
     return parts
 
@@ -262,6 +262,21 @@ def check_revolutions(where: str, readings: AnyArray, arm: Arm, advice: str) -> 
             f"{where} pose {row} joint {column} is {size.max():g} rad, more than four revolutions, so the readings are "
             f"probably in degrees; {advice}."
         )
+
+
+def check_beside(where: str, readings: Float[np.ndarray, "... columns"], arm: Arm) -> None:
+    """Raise `InputError` where what was recorded beside the joints' readings cannot be what the arm has it for."""
+    columns = {name: readings[..., part] for name, part in arm.beside.slices(readings.shape[-1]).items()}
+    check_temperatures(where, columns["thermometer"])
+    directions, load = columns["directions"], columns["load"]
+    if np.any(wrong := ~np.isin(directions, (-1.0, 0.0, 1.0))):
+        *_, row, column = np.argwhere(wrong)[0]
+        raise InputError(
+            f"{where} pose {row + 1} has the direction {directions[wrong].flat[0]:g} of joint {column + 1}; give 1 "
+            "where the reading was rising, -1 where it was falling, or 0 where this is unknown."
+        )
+    if np.any(load < 0):
+        raise InputError(f"{where} has a load of {load.min():g} kg; give the mass at the tip in kg, 0 for none.")
 
 
 def check_temperatures(where: str, temperatures: Float[np.ndarray, "..."]) -> None:

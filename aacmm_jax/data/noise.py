@@ -73,7 +73,7 @@ class Noise(eqx.Module):
         return angular if self.linear_encoder is None else xp.where(kinds.mask(), self.linear_encoder, angular)
 
     def of_columns(self, kinds: JointKinds | None, joints: int, columns: int) -> Float[np.ndarray, " columns"]:
-        """Standard deviations of all columns of readings, rad and mm; 0 for torques and temperatures."""
+        """Standard deviations of all columns of readings, rad and mm; 0 for what is recorded beside them."""
         of_joints = np.broadcast_to(np.asarray(self.of_readings(kinds)), (joints,))
         return np.concatenate([of_joints, np.zeros(columns - joints)])
 

@@ -17,12 +17,13 @@ from ..kinematics.arm import Arm, is_single, joint_limits
 from ..kinematics.chain import length_scale
 from ..kinematics.corrected_arm import holding_torques
 from ..kinematics.correction_kinds import REFERENCE_TEMPERATURE
-from ..kinematics.inverse_kinematics import random_configurations
+from ..kinematics.inverse_kinematics import project_to_targets, random_configurations
 from .capture import Capture
 from .capture_data import ReferenceLength, check_temperatures
 from .noise import Noise
 from .observations.declared import MOST_POSES
-from .observations.observation import AbstractObservation, AbstractSimulated
+from .observations.observation import AbstractObservation
+from .observations.simulated import AbstractSimulated
 
 _RESOLUTION = Annotated[Float[AnyArray, ""] | Float[AnyArray, " 2"], Range(least=0)]
 
@@ -41,6 +42,7 @@ def simulate(
     limits: Sequence[Sequence[float]] | None = None,
     observations: Iterable[AbstractSimulated] = (),
     temperature: Numbers | None = None,
+    load: Numbers | None = None,
     seed: int = 0,
 ) -> Capture:
     """Record a capture with a simulated arm; without noise unless asked for.
@@ -65,6 +67,8 @@ def simulate(
         observations: Other observations to record (`data.observations`), with their true geometry.
         temperature: Of an arm with a thermometer, C: one for all poses, by default 20, or the lowest and the highest,
             between which each pose's is drawn; the last column of the readings.
+        load: Of an arm with a load, kg: one for all poses, by default 0, or the lowest and the highest. Of an arm with
+            directions, each joint is moved to each pose from a random side.
         seed: Seed of poses and noise.
 
     Returns:
@@ -92,7 +96,8 @@ def simulate(
         raise InputError("simulate needs a single arm, but this is a batch; select one arm of the batch.")
     check_finite(arm=arm, noise=noise)
     noise.check_joints(arm.joints)
-    temperatures = _checked_temperatures(arm, temperature)
+    drawn = {"thermometer": _ends(arm, temperature, "thermometer"), "load": _ends(arm, load, "load")}
+    check_temperatures("the simulation", drawn["thermometer"])
     simulated = items_of(observations, "observations")
     if not isinstance(sockets, Mapping) or not (sockets or simulated):
         raise InputError("simulate needs at least one socket with its position, or one observation.")
@@ -103,7 +108,7 @@ def simulate(
     angular, linear = np.append(np.asarray(checked(resolution_arcsec, _RESOLUTION, "resolution_arcsec")), 0.0)[:2]
     slides = np.zeros(arm.joints, dtype=bool) if arm.geometry.kinds is None else arm.geometry.kinds.mask()
     step = np.where(slides, linear, angular * ARCSEC)
-    recorder = _Recorder(arm, noise, limits_array, step, temperatures, random_generator(seed))
+    recorder = _Recorder(arm, noise, limits_array, step, drawn, random_generator(seed))
     reach_key, seat_key, encoder_key, length_key = jax.random.split(random_key(seed), 4)
     places = np.array([np.asarray(point) for point in points.values()]).reshape(-1, 3)
     exact = np.repeat(places, list(counts.values()), axis=0)
@@ -124,24 +129,30 @@ class _Recorder(NamedTuple):
     noise: Noise
     limits: Float[np.ndarray, "n 2"]
     step: Float[np.ndarray, " n"]  # readings are multiples of it, rad and mm; 0 for exact ones
-    temperatures: Float[np.ndarray, " 2"]  # the lowest and the highest, C
-    random: np.random.Generator  # of temperatures
+    drawn: dict[str, Float[np.ndarray, " 2"]]  # the lowest and the highest temperature, C, and load, kg
+    random: np.random.Generator  # of what is drawn, and of directions
 
     def configurations(
         self, holding: Arm, points: Float[np.ndarray, "m 3"], reach_key: Array, seat_key: Array, labels: Sequence[str]
     ) -> Float[np.ndarray, "m columns"]:
-        """Random configurations of an arm at points, where the seat lets it be; with torques and temperatures."""
+        """Random configurations of an arm at points, where the seat lets it be, with what is recorded beside them."""
         targets = points + self.noise.seating * random_numbers("normal", seat_key, points.shape)
-        low, high = self.temperatures
-        temperature = self.random.uniform(low, high, (len(labels), int(holding.thermometer)))
-        at_zero = np.concatenate([np.zeros((len(labels), holding.joints)), temperature], axis=1)
-        targets = targets / length_scale(holding.geometry, at_zero)[:, None]
-        angles = random_configurations(holding, targets, reach_key, self.limits, labels=labels)
-        torques = [holding_torques(holding, np.asarray(angles))] if holding.torques else []
-        return np.concatenate([angles, *torques, temperature], axis=1)
+        beside = holding.beside
+        q = np.zeros((len(labels), beside.width(beside.possible)))
+        columns = {name: q[:, part] for name, part in beside.slices(q.shape[1]).items()}
+        for name, (low, high) in self.drawn.items():
+            columns[name][:] = self.random.uniform(low, high, columns[name].shape)
+        columns["directions"][:] = self.random.choice([-1.0, 1.0], columns["directions"].shape)
+        scaled = targets / length_scale(holding.geometry, q)[:, None]
+        q[:, : holding.joints] = random_configurations(holding, scaled, reach_key, self.limits, labels=labels)
+        if columns["torques"].size:
+            columns["torques"][:] = holding_torques(holding, q)
+        if {"directions", "load"} & set(beside.possible):
+            q, _ = project_to_targets(holding, q, targets)
+        return q
 
     def read(self, q: Float[np.ndarray, "m columns"], key: Array) -> Float[np.ndarray, "m columns"]:
-        """What the encoders show; torques and temperatures are exact."""
+        """What the encoders show; what is recorded beside them is exact."""
         angles, beside = q[:, : self.arm.joints], q[:, self.arm.joints :]
         shown = angles + self.noise.of_readings(self.arm.geometry.kinds) * random_numbers("normal", key, angles.shape)
         step = np.where(self.step > 0, self.step, 1.0)
@@ -166,16 +177,15 @@ class _Recorder(NamedTuple):
         return simulated.recorded(self.read(angles, encoder_key), transforms, random)
 
 
-def _checked_temperatures(arm: Arm, given: Numbers | None) -> Float[np.ndarray, " 2"]:
-    """The lowest and the highest temperature of an arm with a thermometer."""
-    if given is not None and not arm.thermometer:
-        raise InputError(
-            "a temperature is given, but the arm has no thermometer; create the arm with thermometer=True."
-        )
-    values = np.asarray(as_floats(REFERENCE_TEMPERATURE if given is None else given, "temperature"))
+def _ends(arm: Arm, given: Numbers | None, name: str) -> Float[np.ndarray, " 2"]:
+    """The lowest and the highest temperature or load of an arm whose readings have it."""
+    what, unit = ("temperature", "C") if name == "thermometer" else (name, "kg")
+    if given is not None and name not in arm.beside.possible:
+        raise InputError(f"a {what} is given, but the arm has no {name}; create the arm with {name}=True.")
+    usual = REFERENCE_TEMPERATURE if name == "thermometer" else 0.0
+    values = np.asarray(as_floats(usual if given is None else given, what))
     if values.shape not in ((), (2,)) or np.any(np.diff(np.atleast_1d(values)) < 0):
-        raise InputError("temperature must be one number, or the lowest and the highest temperature, in C.")
-    check_temperatures("the simulation", values)
+        raise InputError(f"{what} must be one number, or the lowest and the highest {what}, in {unit}.")
     return np.broadcast_to(values, (2,))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.numpy_or_jax import to_numpy
-from ..kinematics.arm import DOWN, Arm
+from ..kinematics.arm import Arm
 from ..kinematics.chain import forward_pass, joint_motion
 from ..kinematics.corrected_arm import function_values
 from ..kinematics.correction_kinds import Term
@@ -108,7 +108,7 @@ def columns_of(terms: Sequence[MissingTerm], rows: Sequence[Rows]) -> list[Float
 def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
     """Everything that is looked for. Masses are not known, so each link that bends a joint has its own coefficient.
 
-    ``q`` are all readings in their order, rad; with a thermometer, the temperature last, C.
+    ``q`` are all readings in their order, rad, with what was recorded beside them.
     """
     arm = to_numpy(arm)
     order = np.linspace(-1.0, 1.0, len(q))[:, None]
@@ -131,11 +131,9 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
         drifts = [named("drifting zero", joint, time) for joint in range(1, arm.joints + 1)]
         of_joints += [_settling(term) for term in drifts] if settles else drifts
     of_joints += [named("zero", joint, np.ones_like(order), relative=True) for joint in range(1, arm.joints + 1)]
-    nominal = arm.geometry if arm.corrections is None else arm.corrections.nominal
-    gravity = np.asarray(DOWN if arm.gravity is None else arm.gravity)
     for name, (kind, sought) in all_sought().items():
         terms = terms_of(model_with(kind, sought.option), arm.joints)
-        values = function_values(nominal, terms, q, gravity)
+        values = function_values(arm, terms, q)
         if kind.of_arm:
             growth = [row for row, term in zip(values, terms, strict=True) if not term.joint and np.ptp(row) > 0]
             of_tip += [named(name, None, row[:, None, None] * tip / 1e3) for row in growth]

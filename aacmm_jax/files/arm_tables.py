@@ -177,6 +177,8 @@ class ArmFile(Strict):
     base: str | None = None  # its links
     tip: str | None = None
     torques: bool = False
+    directions: bool = False
+    load: bool = False
     thermometer: bool = False
     identification: Identification | None = None
     corrections: CorrectionsTable | None = None

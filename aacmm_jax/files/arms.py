@@ -1,4 +1,4 @@
-"""Arms in TOML files, one row per joint or a URDF, URDF files, and the arms that ship with the package."""
+"""Arms in TOML files, one row per joint or a URDF, files of robots, and the arms that ship with the package."""
 
 import math
 import os
@@ -12,21 +12,22 @@ from ..core.errors import InputError, naming, nearest
 from ..core.text import printable
 from ..data.capture import Capture
 from ..data.noise import ArmNoise
-from ..kinematics.arm import Arm, correction_names, is_length
+from ..kinematics.arm import Arm, correction_names, is_length, reading_as
 from ..kinematics.axes_to_dh import without_far_frames
+from ..kinematics.beside import COLUMNS
 from ..kinematics.corrected_arm import loads_of
 from ..kinematics.independence import nearly_parallel
 from ..kinematics.parameters import ArmSpecification, single, with_tool
 from ..uncertainty.target_parameters import determined_parameters, only_targets
 from .arm_tables import GEOMETRY, ArmFile, Identification, NoiseTable
 from .controllers import read_ur_kinematics
+from .inputs import ROBOT_FILES
 from .outputs import as_path, storable, write_text
 from .toml import read_toml
 from .urdf import read_urdf
 
 _SHIPPED = Path(__file__).with_name("shipped_arms")
-_ROBOTS = (".urdf", ".xacro")  # the latter for the message that says how to expand it
-_OTHER_FORMATS = (*_ROBOTS, ".yaml", ".yml")
+_OTHER_FORMATS = (*ROBOT_FILES, ".yaml", ".yml")
 _SMALLEST, _LARGEST = 5.0, 50_000.0  # mm: no arm's tip is always as near its base, or ever as far
 _FAR = 10_000.0  # mm: no link is as long, but frames on nearly parallel axes may be as far away
 
@@ -54,10 +55,11 @@ def load_arm(
     and in the first D-H frame otherwise (`files.urdf_chain` has the transform); readings are the URDF's joint values.
 
     Args:
-        source: Name of a shipped arm (``"cheng2018-simulation"``), or path of a TOML file, a URDF, or a Universal
-            Robots ``kinematics.yaml``.
-        base: Of a URDF: the link that does not move; by default its root.
-        tip: Of a URDF: the link at the end; by default the only one that has no link after it.
+        source: Name of a shipped arm (``"cheng2018-simulation"``), or path of a TOML file, a URDF, MJCF (``.xml``),
+            or a Universal Robots ``kinematics.yaml``.
+        base: Of a URDF: the link that does not move; by default its root. Of MJCF: a body, by default ``"world"``.
+        tip: Of a URDF: the link at the end; by default the only one that has no link after it. Of MJCF: a body or site,
+            by default the only body without one after it.
         probe: A tool's tip ``(3,)`` in the frame of the last link, mm; by default that frame's origin. Not of an arm
             file that states one.
 
@@ -163,10 +165,10 @@ def read_arm(
     """The arm of a file as `load_specification` takes it, and whether the file proposes an identification."""
     path = _path_of(source)
     suffix = path.suffix.lower()
-    if suffix in _ROBOTS:
+    if suffix in ROBOT_FILES:
         return read_urdf(path, base=base, tip=tip, probe=probe), False
     if base is not None or tip is not None:
-        raise InputError(f"{source} is not a URDF, but base and tip name links of a URDF; omit base and tip.")
+        raise InputError(f"{source} is not a URDF or MJCF, but base and tip name links of one; omit base and tip.")
     if suffix in _OTHER_FORMATS:
         return read_ur_kinematics(path, probe=probe), False
     if suffix != ".toml" and not os.path.exists(path):
@@ -194,8 +196,7 @@ def _specification(path: Path, model: ArmFile, probe: Numbers | None) -> ArmSpec
         arm = _arm_of_rows(model)
         specification = ArmSpecification(arm if probe is None else with_tool(arm, probe))
     arm = specification.arm
-    if model.torques or model.thermometer:
-        arm = arm.replace(torques=model.torques, thermometer=model.thermometer)
+    arm = reading_as(arm, [name for name in COLUMNS if getattr(model, name)])
     if model.corrections is not None:
         arm = model.corrections.corrected(arm, units)
     prior = None if model.priors is None else model.priors.prior(arm, units)
@@ -305,7 +306,7 @@ def specification_toml(specification: ArmSpecification, *, source: str = "", pro
     document.update({"convention": "standard", "length_unit": "mm", "angle_unit": "rad"})
     geometry = {kind: np.asarray(getattr(arm, kind)).tolist() for kind in GEOMETRY if getattr(arm, kind) is not None}
     document["probe"] = geometry.pop("probe")
-    facts = {"prismatic": list(arm.prismatic), "torques": arm.torques, "thermometer": arm.thermometer}
+    facts = {"prismatic": list(arm.prismatic)} | dict.fromkeys(arm.recorded, True)
     document.update({key: fact for key, fact in facts.items() if fact})
     rows = tomlkit.array().multiline(True)
     for i in range(arm.joints):

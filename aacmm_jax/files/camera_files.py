@@ -38,12 +38,8 @@ class StoredCamera(NamedTuple):
 
 def read_camera(path: str | os.PathLike) -> StoredCamera:
     """A camera from a ROS ``camera_info`` (YAML) or from OpenCV's ``FileStorage`` (YAML, JSON). Raises `InputError`."""
-    file = InputFile(path)
+    text = InputFile(path).text
     with naming(path):
-        try:
-            text = file.text
-        except UnicodeDecodeError as error:
-            raise InputError("the file is not UTF-8 text; give a YAML or JSON file.") from error
         if len(text) > _MOST:
             raise InputError(f"the file has more than {_MOST:,} characters; give the file of one camera.")
         entries = _of_json(text) if text.lstrip().startswith("{") else _of_yaml(text)

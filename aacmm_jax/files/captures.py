@@ -13,10 +13,11 @@ from ..data.capture import Capture, ReferenceLength, check_one_capture, check_re
 from ..data.capture_data import UNKNOWN, Repeated
 from ..data.noise import ArmNoise
 from ..data.observations.declared import Entry
-from ..data.observations.observation import AbstractObservation, kinds
+from ..data.observations.observation import AbstractObservation
+from ..data.observations.simulated import kinds
 from ..data.recording import ProbedSphere, ReadImage, Recording, checked_sphere
-from ..kinematics.arm import Arm, correction_names, readings_unit
-from ..kinematics.chain import beside_joints
+from ..kinematics.arm import Arm, correction_names, reading_as, readings_unit
+from ..kinematics.beside import BY_JOINT, COLUMNS
 from ..kinematics.corrected_arm import loads_of
 from ..kinematics.parameters import ArmSpecification, UrdfSource, single
 from ..kinematics.priors import Prior
@@ -25,8 +26,19 @@ from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, un
 from .records import Field, attribute_name, record_in, row_values, rows_in, rows_table, table_of, values_in
 from .schema import ARM, IMAGES, LENGTHS, RECORDING, SPHERES, USUAL_NOISE
 from .stored_checks import read_checked
+from .urdf import located, urdf_chain
 
 _OBSERVATION = "observation_"
+_BESIDE = {  # the variables of what was recorded beside the joints' readings
+    "torques": ("torque", "N m", "torque of the joint's drive"),
+    "directions": (
+        "direction",
+        "1",
+        "1 after a rising reading of the joint, -1 after a falling one, 0 unknown",
+    ),
+    "load": ("load", "kg", "mass at the tip"),
+    "thermometer": ("temperature", "degC", "temperature of the arm"),
+}
 
 
 def save_capture(path: str | os.PathLike, recording: Recording, summary: Mapping[str, Any] | None = None) -> None:
@@ -121,6 +133,7 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     poses, nominal = stored.tables["capture"], specification_of(path, stored, "nominal_arm")
     q, owner = _readings_of(poses, "angle"), np.asarray(poses["socket"]).astype(str)
     names = list(dict.fromkeys(owner.tolist()))
+    nominal = nominal._replace(arm=reading_as(nominal.arm, _recorded(poses)))
     visits = poses.get("visit")
     if visits is not None:
         visits = {name: visits[owner == name] for name in names if np.all(visits[owner == name] != UNKNOWN)}
@@ -147,7 +160,9 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     table = stored.tables.get("urdf")
     if table is not None:
         text = "".join(map(str, table["text"]))
-        nominal = nominal._replace(urdf=UrdfSource(text, table.attributes["base"], table.attributes["tip"]))
+        source = UrdfSource(text, table.attributes["base"], table.attributes["tip"])
+        with naming(path):
+            nominal = nominal._replace(urdf=located(source, urdf_chain(source), nominal.arm))
     return Recording(
         capture,
         nominal,
@@ -188,20 +203,25 @@ def _observation(path: str | os.PathLike, table: StoredTable) -> AbstractObserva
 
 
 def _reading_variables(name: str, readings: Float[np.ndarray, "N n"], arm: Arm, rows: str = "pose") -> dict:
-    """Readings as variables: those of the joints, and the torques and the temperature that may follow them."""
+    """Readings as variables: those of the joints, and what was recorded beside them."""
     variables = {name: Variable((rows, "joint"), readings[:, : arm.joints], readings_unit(arm), "joint reading")}
-    torques, temperature = (readings[:, columns] for columns in beside_joints(arm.joints, readings.shape[1]))
-    if torques.size:
-        variables["torque"] = Variable((rows, "joint"), torques, "N m", "torque of the joint's drive")
-    if temperature.size:
-        variables["temperature"] = Variable((rows,), temperature[:, 0], "degC", "temperature of the arm")
+    slices = arm.beside.slices(readings.shape[1])
+    for beside in arm.beside.names(readings.shape[1]):
+        values, (variable, *says) = readings[:, slices[beside]], _BESIDE[beside]
+        by_joint = beside in BY_JOINT
+        axes = (rows, "joint") if by_joint else (rows,)
+        variables[variable] = Variable(axes, values if by_joint else values[:, 0], *says)
     return variables
 
 
 def _readings_of(table: Mapping[str, np.ndarray], name: str) -> Float[np.ndarray, "N n"]:
-    """The readings that `_reading_variables` wrote, with torques and the temperature last where there are such."""
-    beside = [table[column] for column in ("torque", "temperature") if column in table]
+    """The readings that `_reading_variables` wrote, with what was recorded beside them."""
+    beside = [table[_BESIDE[column][0]] for column in _recorded(table)]
     return np.column_stack([table[name], *beside]) if beside else table[name]
+
+
+def _recorded(table: Mapping[str, np.ndarray]) -> list[str]:
+    return [name for name in COLUMNS if _BESIDE[name][0] in table]
 
 
 def lengths_of(stored: Stored) -> tuple[ReferenceLength, ...]:
@@ -245,8 +265,7 @@ def arm_table(specification: ArmSpecification) -> Table:
     """An arm as a table over ``joint``, with its proposed identification in attributes."""
     arm, prior = single(specification.arm), specification.prior
     values = dict.fromkeys(ARM) | specification._asdict() | {kind: getattr(arm, kind) for kind in GEOMETRY}
-    values |= {"prismatic": arm.prismatic or None, "thermometer": arm.thermometer or None}
-    values["torques"] = arm.torques or None
+    values |= {"prismatic": arm.prismatic or None} | {name: name in arm.recorded or None for name in COLUMNS}
     if arm.limits is not None:
         values["lowest"], values["highest"] = np.transpose(arm.limits)
     if arm.corrections is not None:
@@ -282,9 +301,8 @@ def specification_of(path: str | os.PathLike, stored: Stored, name: str) -> ArmS
             **{kind: table.get(kind) if kind == "beta" else table[kind] for kind in GEOMETRY},
             limits=limits,
             prismatic=list(attributes.get("prismatic", ())),
-            torques=bool(attributes.get("torques", False)),
-            thermometer=bool(attributes.get("thermometer", False)),
         )
+        arm = reading_as(arm, [name for name in COLUMNS if attributes.get(name, False)])
         if "coefficients" in table:
             nominal = {kind: table[f"nominal_{kind}"] for kind in GEOMETRY if f"nominal_{kind}" in table}
             coefficients = dict(zip(map(str, table["coefficient"]), table["coefficients"], strict=True))

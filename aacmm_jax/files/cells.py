@@ -150,8 +150,8 @@ def _urdf_body(
     Links whose meshes are not at hand have capsules of this ``radius``, mm, about the lengths of their D-H row instead,
     and so has a probe beyond the tip. No body where the URDF has no collision shapes on these links.
     """
-    chain, shapes = urdf_chain(urdf), collision_shapes(urdf.text)
-    frames = dh_frames(geometry_of(chain.arm), chain.base)
+    chain = urdf_chain(urdf)
+    shapes, frames = collision_shapes(chain.robot), dh_frames(geometry_of(chain.arm), chain.base)
     rows: list[_Row] = []
     missing: dict[int, str] = {}
     for number, link, link_frame in chain.carried_links(urdf.base):

@@ -237,12 +237,8 @@ def read_ur_kinematics(path: str | os.PathLike, *, probe: Numbers | None = None)
     It is in the controller's base frame (``base_link_inertia`` of the URDF); its limits are those of these robots'
     joints, two revolutions.
     """
-    file = InputFile(path)
+    text = InputFile(path).text
     with naming(path):
-        try:
-            text = file.text
-        except UnicodeDecodeError as error:
-            raise InputError("the file is not UTF-8 text; give a YAML file.") from error
         entries = _entries(text)
         if any(name in entries for name in _DH):
             theta, a, d, alpha = (_numbers_of(entries, name, len(_JOINTS)) for name in _DH)
@@ -252,7 +248,7 @@ def read_ur_kinematics(path: str | os.PathLike, *, probe: Numbers | None = None)
         arm = without_far_frames(arm_of(geometry, [_LIMITS] * len(_JOINTS)))
         if probe is not None:
             arm = with_tool(arm, probe)
-        return ArmSpecification(arm, os.path.splitext(os.path.basename(os.fspath(file)))[0])
+        return ArmSpecification(arm, os.path.splitext(os.path.basename(os.fspath(path)))[0])
 
 
 def ur_kinematics_yaml(arm: Arm) -> str:

@@ -13,6 +13,7 @@ from ..core.errors import InputError
 from .outputs import as_path, reading, waiting
 
 LARGEST_FILE = "AACMM_LARGEST_FILE_MB"  # environment variable: size limit of inputs, MiB
+ROBOT_FILES = (".urdf", ".xacro", ".xml", ".mjcf")  # URDF and MJCF; xacro for the message that says how to expand it
 STREAMED = 100  # a study's file, which is read in parts, may be larger than the limit by this factor
 
 
@@ -46,8 +47,11 @@ class InputFile(os.PathLike):
     @property
     def text(self) -> str:
         """The content as text in UTF-8, with or without a byte order mark; lines end with a line feed. Raises
-        `UnicodeDecodeError`."""
-        return self.content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+        `InputError`."""
+        try:
+            return self.content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+        except UnicodeDecodeError as error:
+            raise InputError(f"{self} is not UTF-8 text; save it as UTF-8.") from error
 
 
 @contextlib.contextmanager

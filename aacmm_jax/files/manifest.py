@@ -16,12 +16,12 @@ from ..core.text import shorten
 from ..data.capture import Capture, ReferenceLength, check_readings, join_sessions
 from ..data.observations.held import Socket
 from ..data.recording import ProbedSphere, ReadImage, Recording, checked_sphere
-from ..kinematics.arm import Arm
-from ..kinematics.chain import beside_joints
+from ..kinematics.arm import Arm, reading_as
 from ..kinematics.parameters import ArmSpecification
 from ..kinematics.workspace import Reach
 from .arms import arm_beside, for_capture, read_arm, usual_noise
 from .inputs import InputFile
+from .lerobot_motors import angles_by_motors
 from .manifest_pixels import Cameras, Detecting, Progress, observations_of, without_progress
 from .manifest_readings import Readings, points_of
 from .manifest_rows import Source, name_of, parts
@@ -66,9 +66,9 @@ def read_manifest(
         (40,)
     """
     manifest = path if isinstance(path, InputFile) else InputFile(path)
-    detecting = Detecting(progress, None if overlays is None else Path(overlays))
+    detecting = Detecting(progress, None if overlays is None else Path(overlays), {})
     recording, readings = _read(manifest, detecting)
-    other = other_readings(manifest, recording, readings.header, lambda changed: _read(changed)[0])
+    other = other_readings(manifest, recording, readings.header, lambda changed: _read(changed, detecting)[0])
     return recording._replace(other_readings=other)
 
 
@@ -83,8 +83,11 @@ def _read(path: str | os.PathLike, detecting: Detecting = _QUIETLY) -> tuple[Rec
     with naming(path):
         arm = arm_beside(path.parent, model.arm)
         nominal, proposed = read_arm(arm, base=model.base, tip=model.tip, probe=model.probe)
-        readings = Readings(nominal.arm, model.angles)
-        source = Source(manifest, "q", readings)
+        source = Source(manifest, "q")
+        angles = model.angles
+        if angles is not None and angles.calibration is not None:
+            angles = angles_by_motors(angles, source.open(angles.calibration), nominal.arm.joints)
+        source.rows = readings = Readings(nominal.arm, angles)
         sockets, lengths, spheres = _read_recorded(model, source)
         observed: list[tuple[str, Any]] = [(seat.session, seat) for seat in sockets.values() if not seat.target]
         # Where another tip than the arm's own probe was held, it is an observation.
@@ -110,9 +113,7 @@ def _read(path: str | os.PathLike, detecting: Detecting = _QUIETLY) -> tuple[Rec
                 "[sessions] applies only to tables with a session, but no table has a session; remove [sessions]."
             )
         capture = _capture(lengths, observed, probe == "remounted")
-        torques, temperature = beside_joints(nominal.arm.joints, capture.columns)
-        beside = {"torques": torques.stop > torques.start, "thermometer": temperature.start < capture.columns}
-        nominal = nominal._replace(arm=nominal.arm.replace(**{key: True for key, given in beside.items() if given}))
+        nominal = nominal._replace(arm=reading_as(nominal.arm, readings.beside))
         check_readings(capture, nominal.arm)
         as_found = None if model.as_found is None else _as_found(arm_beside(path.parent, model.as_found), nominal.arm)
         recording = Recording(
@@ -127,6 +128,7 @@ def _read(path: str | os.PathLike, detecting: Detecting = _QUIETLY) -> tuple[Rec
             as_found=as_found,
             stated=_stated(model),
             images=tuple(images),
+            notes=tuple(source.notes),
         )
         return recording, readings
 
@@ -148,7 +150,7 @@ def _stated(model: Any) -> tuple[str, ...]:
 def _as_found(file: str | Path, nominal: Arm) -> ArmSpecification:
     """The arm as it arrived, which reads as the nominal one does."""
     specification = read_arm(file)[0]
-    arm = specification.arm.replace(torques=nominal.torques, thermometer=nominal.thermometer)
+    arm = reading_as(specification.arm, nominal.recorded)
     if (arm.joints, arm.prismatic) != (nominal.joints, nominal.prismatic):
         raise InputError(
             f"as_found = '{Path(file).name}' has {arm.joints} joints or other prismatic joints than arm, which has "
@@ -178,7 +180,8 @@ def read_points(path: str | os.PathLike) -> Measured:
     model = read_toml(manifest := InputFile(path), PointsManifest)
     stated = model.points
     with naming(as_path(path)):
-        source = Source(manifest, "points", lambda text, wanted: points_of(text, wanted, stated))
+        source = Source(manifest, "points")
+        source.rows = lambda text, wanted: points_of(text, wanted, stated)
         seated, lengths, spheres = _read_recorded(model, source)
         for length in lengths:
             for end in (length.start, length.end):

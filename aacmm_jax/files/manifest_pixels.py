@@ -1,5 +1,6 @@
 """[[pixels]] of a manifest: images of a target, or tables of corners, with the readings of their poses."""
 
+import base64
 import glob
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..camera.consistency import is_mirrored, on_one_line
 from ..core.errors import InputError, naming, nearest
 from ..core.text import quoted, shorten
 from ..core.units import LENGTH_UNITS
@@ -18,14 +20,13 @@ from ..data.observations.pixels import Pixels
 from ..data.recording import ReadImage
 from ..data.targets import AbstractTarget, target_of
 from .camera_files import read_camera
-from .corner_tables import NO_CORNERS, Seen, matched, natural_order, read_corners
+from .corner_files import NO_CORNERS, Seen, corners_of_json, corners_of_table, matched, natural_order
 from .manifest_cameras import CameraTable, PixelsTable, TargetTable
 from .manifest_files import as_list
 from .manifest_readings import checked_unit
 from .manifest_rows import Source, parts
 from .outputs import write_atomically
 from .patterns import fill
-from .text_table import TextTable
 
 _FEWEST = 4  # corners of an image that determine the pose of a board
 Progress = Callable[[Sequence[Any], str], Iterable[Any]]  # shows how many of the items are done
@@ -41,6 +42,7 @@ class Detecting(NamedTuple):
 
     progress: Progress = without_progress
     overlays: Path | None = None  # folder of a picture for each image, with the corners that were found in it
+    found: dict[Any, list[Seen]] | None = None  # in images that were read before, by where they are and what is in them
 
 
 class _Poses(Declared):
@@ -84,7 +86,7 @@ class Cameras:
 
 def _points_of(source: Source, table: TargetTable) -> dict[str, Any]:
     """Ids and coordinates, mm, of a table of points."""
-    text = TextTable(source.open(str(table.file)), decimal=None)
+    text = source.table(str(table.file), decimal=None, tables=as_list(table.table or []))
     ids = text.numbers(text.pick(as_list(table.columns.get("id", "id"))))[:, 0]
     picked = text.pick(as_list(table.columns.get("points", ["x", "y", "z"])))
     if len(picked) != 3:
@@ -172,17 +174,24 @@ def observations_of(
             ]
             of_group = name if entry.group is None else f"{name}/{part.group}"
             named = "/".join(filter(None, (part.session, of_group)))
-            read += [ReadImage(named, image.label, len(image.ids), image.refused) for image in images]
+            read += [_read(named, image, image.refused) for image in images]
             used = [i for i, image in enumerate(images) if not image.refused]
             _check_once(q, images, used)
             if not used:
-                reasons = list(dict.fromkeys(f"{quoted(image.label)}: {image.refused}" for image in images))
-                raise InputError(f"no image can be used: {shorten(reasons, 3)}.")
+                labels: dict[str, list[str]] = {}
+                for image in images:
+                    labels.setdefault(image.refused, []).append(quoted(image.label))
+                reasons = [f"{shorten(of_reason, 1)}: {reason}" for reason, of_reason in labels.items()]
+                raise InputError(f"no image can be used ({shorten(reasons, 3)}); take other images, or correct these.")
             chosen = [images[i] for i in used]
             observed.append((part.session, _pixels(of_group, entry, camera, target, q[used], chosen)))
     named_images = {image.image for image in read}
     others = [image for image in seen if image.label not in named_images]
-    return observed, [*read, *(ReadImage(name, x.label, len(x.ids), "no row of the readings names it") for x in others)]
+    return observed, [*read, *(_read(name, image, "no row of the readings names it") for image in others)]
+
+
+def _read(observation: str, image: Seen, refused: str) -> ReadImage:
+    return ReadImage(observation, image.label, len(image.ids), refused, image.preview)
 
 
 def _seen(
@@ -191,26 +200,41 @@ def _seen(
 ) -> list[Seen]:  # fmt: skip
     """The corners of each image: detected, or read from a table."""
     if entry.corners is not None:
-        file = source.open(fill(entry.corners, values))
-        return read_corners(file, target, camera_models()[camera.model].dimension, entry.corner_columns)
-    from ..camera.detection import detect, overlay
-
+        file, dimension = fill(entry.corners, values), camera_models()[camera.model].dimension
+        if file.lower().endswith(".json"):
+            return corners_of_json(source.open(file), target, dimension)
+        named = as_list(entry.corner_table or (entry.table if file in entry.paths else None) or [])
+        text = source.table(file, decimal=None, tables=named, corners=dimension)
+        return corners_of_table(text, dimension, entry.corner_columns)
     pattern = fill(str(entry.images), values)
+    size = None if camera.image_size is None else tuple(int(number) for number in camera.image_size)
+    found, key = {} if detecting.found is None else detecting.found, (pattern, fill(entry.target, values), size)
+    if key not in found:
+        found[key] = _detected(source, pattern, target, size, detecting)
+    return found[key]
+
+
+def _detected(
+    source: Source, pattern: str, target: AbstractTarget, size: tuple[int, ...] | None, detecting: Detecting
+) -> list[Seen]:
+    """The corners that images show."""
+    from ..camera.detection import detect, overlay, preview, read_image
+
     paths = [Path(path) for path in glob.glob(str(Path(glob.escape(str(source.folder))) / pattern), recursive=True)]
     names = natural_order([path.relative_to(source.folder).as_posix() for path in paths if path.is_file()])
     if not names:
         raise InputError(f"no image matches '{pattern}' in {source.folder}; check the path.")
-    size = None if camera.image_size is None else tuple(int(number) for number in camera.image_size)
     seen = []
     for name in detecting.progress(names, "Detecting corners"):
-        image = source.open(name)
+        image = read_image(source.open(name))
         found = detect(image, target, image_size=size)
         if detecting.overlays is not None:
             detecting.overlays.mkdir(parents=True, exist_ok=True)
             # Images of several folders may have the same name.
             with write_atomically(detecting.overlays / f"{name.replace('/', '_')}.jpg") as path:
                 path.write_bytes(overlay(image, found))
-        seen.append(Seen(name, found.ids, found.corners, found.refused, found.size))
+        small = base64.b64encode(preview(image)).decode()
+        seen.append(Seen(name, found.ids, found.corners, found.refused, found.size, small))
     return seen
 
 
@@ -229,9 +253,19 @@ def _checked(image: Seen, camera: Camera, target: AbstractTarget) -> Seen:
             f"{label} has the point id {ids[counts.argmax()]} twice; give one row for each corner, and one image for "
             "each pose."
         )
-    if not image.refused and len(ids) < _FEWEST:
-        return image._replace(refused=f"only {len(ids)} corners were found; at least {_FEWEST} are needed")
-    return image
+    return image._replace(refused=image.refused or _why_useless(image, target))
+
+
+def _why_useless(image: Seen, target: AbstractTarget) -> str:
+    """Why the corners of an image show no view of a target; empty where they do."""
+    if len(image.ids) < _FEWEST:
+        return f"only {len(image.ids)} corners were found; at least {_FEWEST} are needed"
+    points = target.points_of(image.ids)
+    if on_one_line(points):
+        return f"its {len(points)} corners are on one line"
+    if target.kind != "points" and image.corners.shape[1] == 2 and is_mirrored(points[:, :2], image.corners):
+        return "the board is seen from behind: the image is mirrored, or the ids are counted in another order"
+    return ""
 
 
 def _check_once(q: Float[np.ndarray, "m n"], images: Sequence[Seen], used: Sequence[int]) -> None:

@@ -1,7 +1,7 @@
 """Joint readings and points in the text tables of a manifest, in mm and rad: their columns, units and temperatures."""
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,9 +12,10 @@ from ..core.text import quoted
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import check_revolutions
 from ..kinematics.arm import Arm
+from ..kinematics.beside import BY_JOINT, COLUMNS
 from .manifest_files import as_list
 from .manifest_tables import Angles, PointsTable
-from .table_columns import LINE, TEMPERATURE, TORQUE, header_units, position_columns, proposed_columns, reading_columns
+from .table_columns import BESIDE, LINE, header_units, position_columns, proposed_columns, reading_columns
 from .text_lines import Column
 from .text_table import TextTable
 
@@ -26,7 +27,7 @@ class Wanted(NamedTuple):
     unit: str | None = None
     usual_unit: str | None = None  # of the preset, where neither the manifest nor the header states one
     taken: Sequence[int] = ()  # columns, from 0, that hold something else
-    temperature: float | None = None
+    beside: Mapping[str, float | None] = {}  # one value for all rows, of what each row may have in a column
 
 
 def checked_unit(
@@ -46,16 +47,16 @@ def checked_unit(
 
 
 class Readings:
-    """Joint readings of tables, in rad and mm, with the joints' torques, N m, and the arm's temperature as last columns
-    where there are such.
+    """Joint readings of tables, in rad and mm, with what was recorded beside them in the last columns (`beside`).
 
-    Raises `InputError` where columns are missing or not clear, units are missing or differ, or one table has torques or
-    temperatures and another not.
+    Raises `InputError` where columns are missing or not clear, units are missing or differ, or one table has torques,
+    directions, loads or temperatures and another not.
     """
 
     def __init__(self, arm: Arm, angles: Angles | None):
         self._arm, self._angles = arm, angles
-        self._first: tuple[int, str | os.PathLike] | None = None  # columns of readings of the first table, and its file
+        self._first: str | os.PathLike | None = None  # the file of the first table
+        self.beside: tuple[str, ...] = ()  # what the tables have beside the readings
         self.columns: list[int] = []  # of the joints in the first table, from 1
         self.header: list[str] = []  # of the first table
         self.angles: Angles | None = None  # with which the first table was read, its header and units considered
@@ -65,47 +66,48 @@ class Readings:
         stated = wanted.columns
         if stated is None and self._angles is not None and self._angles.columns is not None:
             stated = as_list(self._angles.columns)
-        of_torques = self._torques(text)
-        picked = reading_columns(text, self._arm.joints, [*wanted.taken, *of_torques], stated)
-        thermometer = text.pick([TEMPERATURE]) if text.has([TEMPERATURE]) else []
-        if set(thermometer) & set(picked):
-            raise InputError(
-                f"{text.path} column {thermometer[0] + 1} is {TEMPERATURE}, not a joint reading; remove this column "
-                "from the key columns."
-            )
+        beside = {name: columns for name in COLUMNS if (columns := self._columns_of(text, name))}
+        by_joint = [i for name in BY_JOINT for i in beside.get(name, [])]
+        picked = reading_columns(text, self._arm.joints, [*wanted.taken, *by_joint], stated)
+        for name, columns in beside.items():
+            if set(columns) & set(picked):
+                raise InputError(
+                    f"{text.path} column {columns[0] + 1} is {BESIDE[name]}, not a joint reading; remove this column "
+                    "from the key columns."
+                )
         numbers = text.numbers(picked, measured=True, stated=stated is not None)
         angles = self._angles_of(text, picked, wanted)
         q = angles.converted(numbers, self._arm)
-        if of_torques:
-            q = np.concatenate([q, text.numbers(of_torques)], axis=1)
         check_revolutions(str(text.path), q, self._arm, 'correct the header, or write unit = "deg" in [angles]')
-        temperature = text.numbers(thermometer)[:, 0] if thermometer else None
-        readings = with_temperature(q, temperature, wanted.temperature, str(text.path))
+        recorded = {name: text.numbers(columns) for name, columns in beside.items()}
+        for name, value in wanted.beside.items():
+            column = stated_or_recorded(value, recorded.get(name), BESIDE[name], str(text.path), len(q))
+            recorded |= {} if column is None else {name: column}
+        recorded = {name: recorded[name] for name in COLUMNS if name in recorded}
         if self._first is None:
-            self._first, self.columns = (readings.shape[1], text.path), [i + 1 for i in picked]
+            self._first, self.beside, self.columns = text.path, tuple(recorded), [i + 1 for i in picked]
             self.header, self.angles = list(text.header), angles
-        if self._first[0] != readings.shape[1]:
-            (less, without), (more, other) = sorted(
-                (self._first, (readings.shape[1], text.path)), key=lambda table: table[0]
-            )
-            what, column = ("torques", TORQUE.format("1")) if more - less > 1 else ("temperatures", TEMPERATURE)
-            add = f"add columns {column}, ... to {without}."
-            if column == TEMPERATURE:
-                add = f"add a column {TEMPERATURE} to {without}, or state {TEMPERATURE} in its table."
+        for name in (name for name in COLUMNS if (name in self.beside) != (name in recorded)):
+            without, other = (text.path, self._first) if name in self.beside else (self._first, text.path)
+            what, add = name, f"add columns {BESIDE[name].format(1)}, ... to {without}."
+            if name not in BY_JOINT:
+                what = "temperatures" if name == "thermometer" else name
+                add = f"add a column {BESIDE[name]} to {without}, or state {BESIDE[name]} in its table."
             raise InputError(f"{without} has no {what}, but {other} has {what}; {add}")
-        return readings
+        return np.hstack([q, *recorded.values()])
 
-    def _torques(self, text: TextTable) -> list[int]:
-        """The columns of the joints' torques: those that the manifest names, or that have the usual names."""
-        joints, stated = self._arm.joints, None if self._angles is None else self._angles.torques
-        names = [TORQUE.format(joint) for joint in range(1, joints + 1)] if stated is None else as_list(stated)
-        if joints == 1 or (stated is None and not text.has(names)):
+    def _columns_of(self, text: TextTable, name: str) -> list[int]:
+        """The columns of what was recorded beside the readings: those that the manifest names, or that have the usual
+        names."""
+        count, stated = self._arm.joints if name in BY_JOINT else 1, getattr(self._angles, name, None)
+        names = [BESIDE[name].format(i + 1) for i in range(count)] if stated is None else as_list(stated)
+        if (count == 1 and name == "torques") or (stated is None and not text.has(names)):
             return []
         picked = text.pick(names)
-        if len(picked) != joints:
+        if len(picked) != count:
             raise InputError(
-                f"{text.path} has {len(picked)} columns of torques, but the arm has {joints} joints; pick one per "
-                "joint with torques in [angles]."
+                f"{text.path} has {len(picked)} columns of {name}, but the arm has {count} joints; pick one per joint "
+                f"with {name} in [angles]."
             )
         return picked
 
@@ -141,18 +143,13 @@ class Readings:
         return Angles(**{**stated, "unit": unit})
 
 
-def with_temperature(
-    q: Float[np.ndarray, "N n"], column: Float[np.ndarray, " N"] | None, stated: float | None, where: str
-) -> Float[np.ndarray, "N m"]:
-    """Readings with the temperature as a last column: of a table, or stated once for all, but not both; as they are
-    without either."""
+def stated_or_recorded(
+    stated: float | None, column: Float[np.ndarray, "N 1"] | None, name: str, where: str, rows: int
+) -> Float[np.ndarray, "N 1"] | None:
+    """A column of a table, or what is stated once for all its rows, but not both; None without either."""
     if column is not None and stated is not None:
-        raise InputError(
-            f"{where} has a column {TEMPERATURE}, but the manifest also states {TEMPERATURE}; give only one of the two."
-        )
-    if stated is not None:
-        column = np.full(len(q), float(stated))
-    return q if column is None else np.concatenate([q, column[:, None]], axis=1)
+        raise InputError(f"{where} has a column {name}, but the manifest also states {name}; give only one of the two.")
+    return column if stated is None else np.full((rows, 1), float(stated))
 
 
 def points_of(text: TextTable, wanted: Wanted, points: PointsTable) -> Float[np.ndarray, "N 3"]:

@@ -23,8 +23,9 @@ from ..core.errors import InputError
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import ReferenceLength
 from ..data.observations.held import Socket
-from ..data.observations.observation import AbstractObservation, kinds
+from ..data.observations.observation import AbstractObservation
 from ..data.observations.pixels import Pixels
+from ..data.observations.simulated import kinds
 from ..data.recording import SphereTest
 from ..kinematics.arm import Arm, by_joint
 from ..kinematics.correction_kinds import REFERENCE_TEMPERATURE
@@ -51,17 +52,29 @@ def _rotation(text: str) -> str:
 class Angles(Strict):
     """How every column of readings is turned into rad, or mm of a prismatic joint."""
 
-    unit: Literal["rad", "deg", "arcsec", "gon", "mrad", "counts"]
+    unit: Literal["rad", "deg", "arcsec", "gon", "mrad", "counts", "percent"]
     counts_per_turn: _ByJoint | None = None
     sign: Literal[1, -1] | list[Literal[1, -1]] = 1
     offset: FiniteFloat | list[FiniteFloat] = 0.0
     columns: Picked | None = None
     torques: Picked | None = None  # columns of the joints' torques, N m
+    directions: Picked | None = None  # columns of the directions from which the joints were moved: 1, -1, or 0
     linear_unit: Literal["mm", "m", "um", "inch", "counts"] = "mm"  # of prismatic joints
     counts_per_mm: _ByJoint | None = None
 
+    calibration: str | None = None  # LeRobot's file of the motors
+
     @model_validator(mode="after")
     def _counts(self) -> "Angles":
+        if self.calibration is not None:
+            if self.counts_per_turn is not None or self.unit not in ("counts", "deg", "percent"):
+                raise ValueError(
+                    "calibration states how LeRobot's numbers become angles, so unit must be 'counts', 'deg' or "
+                    "'percent', without counts_per_turn."
+                )
+            return self
+        if self.unit == "percent":
+            raise ValueError("unit = 'percent' is LeRobot's -100 to 100; add calibration, the file of its motors.")
         if (self.unit == "counts") != (self.counts_per_turn is not None):
             raise ValueError("counts_per_turn and unit = 'counts' are only possible together; give both or neither.")
         if (self.linear_unit == "counts") != (self.counts_per_mm is not None):
@@ -110,6 +123,7 @@ class _Table(NamedTable):
     """What the tables of all other kinds have in common."""
 
     readings: str | None = None  # file of the readings, in the same order
+    readings_table: str | None = None  # in that file
     rotation: Annotated[str, AfterValidator(_rotation)] | None = None
     coverage_factor: PositiveFloat | None = None  # of the columns of u
 
@@ -236,9 +250,9 @@ class PointsManifest(Recorded):
     def _one_tip(self) -> "PointsManifest":
         for entry in (*self.socket, *self.sphere):
             seated = isinstance(entry, SocketTable) and (entry.target or entry.session)
-            if seated or entry.temperature_C is not None:
+            if seated or (entry.temperature_C, entry.load_kg) != (None, None):
                 raise ValueError(
-                    "target, session and temperature_C apply only to manifests of joint readings, but "
+                    "target, session, temperature_C and load_kg apply only to manifests of joint readings, but "
                     f"'{entry.name or entry.paths[0]}' has points, which are positions of the tip; remove these keys."
                 )
         return self

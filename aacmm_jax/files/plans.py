@@ -157,9 +157,7 @@ def plan_manifest(
             value = _length(round(float(length.value), 6), float(length.u))
             tables.append(("length", {"from": length.start, "to": length.end} | value))
     elif isinstance(plan, KitPlan):
-        tables += [("target", dict(target)) for target in targets]
-        cameras = {item.camera: item for item in plan.observations if isinstance(item, Pixels)}
-        tables += [("camera", _camera(item)) for item in cameras.values()]
+        tables += camera_tables([item for item in plan.observations if isinstance(item, Pixels)], targets)
         tables += [(item.table, _observation(item, plan.arm.joints)) for item in plan.observations]
     else:
         entries, what = entries | {"acceptance": plan.standard}, what.format(PLANNED[plan.standard])
@@ -169,12 +167,27 @@ def plan_manifest(
         )
         size = [stated if plan.range_stated else f"# {stated} (the plan assumes twice the reach)"]
         tables = _of_procedure(plan)
-    date = "# date = 2026-01-31   # day of the measurement"
+    beside = ["# date = 2026-01-31   # day of the measurement", *size, "", "[angles]", f'unit = "{angles}"']
+    return manifest_text(what, entries, beside, tables)
+
+
+def manifest_text(
+    what: str, entries: Mapping[str, Any], beside: Sequence[str], tables: Sequence[tuple[str, Mapping[str, Any]]]
+) -> str:
+    """A manifest: a comment, its first entries, other lines, and its tables."""
     comment = textwrap.fill(what, 118, initial_indent="# ", subsequent_indent="# ")
-    lines = [comment, *_entries(entries), date, *size, "", "[angles]", f'unit = "{angles}"']
+    lines = [comment, *_entries(entries), *beside]
     for heading, table in tables:
         lines += ["", f"[[{heading}]]", *_entries(table)]
     return "\n".join(lines) + "\n"
+
+
+def camera_tables(
+    observations: Sequence[Pixels], targets: Sequence[Mapping[str, Any]]
+) -> list[tuple[str, dict[str, Any]]]:
+    """The tables of targets, as they are stated, and those of the cameras of some observations."""
+    cameras = {item.camera: item for item in observations}
+    return [("target", dict(target)) for target in targets] + [("camera", _camera(item)) for item in cameras.values()]
 
 
 def _of_procedure(procedure: Procedure) -> list[tuple[str, dict[str, Any]]]:
@@ -217,23 +230,23 @@ def _camera(observation: Pixels) -> dict[str, Any]:
     return table | {"intrinsics": values, "u": ("free" if np.any(u >= FREE) else stated or "exact", says)}
 
 
-def _images(observation: Pixels) -> dict[str, Any]:
-    """The table of images that a camera took."""
+def images_table(observation: Pixels, says: str, kind: str = "png") -> dict[str, Any]:
+    """The table of images that a camera took: files of a kind in a folder of their own, and a file of readings."""
     file = observation.name.replace("/", "-")
     return {
         "name": observation.name,
         "camera": observation.camera,
         "target": observation.board,
         "on_arm": "camera" if observation.on_arm else "target",
-        "file": (f"{file}.csv", "one row per image, in the order of the names of the images"),
-        "images": f"{file}/*.png",
+        "file": (f"{file}.csv", says),
+        "images": f"{file}/*.{kind}",
     }
 
 
 def _observation(observation: AbstractObservation, joints: int) -> dict[str, Any]:
     """The table of one observation."""
     if isinstance(observation, Pixels):
-        return _images(observation)
+        return images_table(observation, "one row per image, in the order of the names of the images")
     file, stored, label = observation.name.replace("/", "-"), observation.stored(), _label(observation)
     table: dict[str, Any] = {"name": observation.name}
     if label is None:

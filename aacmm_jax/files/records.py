@@ -110,10 +110,15 @@ def table_of(record: Any, fields: Fields) -> Table:
 
 
 def rows_table(dimension: str, records: Iterable[Any], fields: Fields) -> Table:
-    """The table of many records: a row each, and one after the other what has a dimension of its own."""
+    """The table of many records: a row each, and one after the other what has a dimension of its own. A text that is
+    None is empty, and left out where all are."""
     records, variables = list(records), {}
     for name, field in fields.items():
         values = [_value(record, name) for record in records]
+        if field.content == "text" and not field.dimensions and None in values:
+            if not any(values):
+                continue
+            values = [value or "" for value in values]
         dimensions = field.dimensions or (dimension,)
         if field.dimensions:
             row = np.repeat(np.arange(len(records)), [len(value) for value in values])
@@ -184,9 +189,11 @@ def records_within(tables: Entries, parts: Mapping[str, Within]) -> dict[str, An
 
 
 def row_values(cls: type, fields: Fields, dimension: str, table: StoredTable, i: int) -> dict[str, Any]:
-    """The fields of one row, from 0."""
+    """The fields of one row, from 0; what may be None may be missing."""
     hints, values = get_type_hints(cls), {}
     for name, field in fields.items():
+        if NoneType in get_args(hints.get(name)) and (field.name or name) not in table:
+            continue
         column = table[field.name or name]
         chosen = column[table[_index(dimension, field)] == i] if field.dimensions else column[i]
         values[name] = restored(hints.get(name, np.ndarray if field.dimensions else _TYPES[field.content]), chosen)

@@ -55,6 +55,7 @@ IMAGES: Fields = {
     "image": text("name of the image, or number of its pose"),
     "corners": count("number of corners"),
     "refused": text("why the image is not used; empty if it is used"),
+    "preview": text("small picture of the image (JPEG, base64)"),
 }
 
 _COEFFICIENTS = ("coefficient", "coefficient_2")
@@ -91,6 +92,8 @@ ARM: Fields = {
     "highest": number("highest reading of the joint", "rad", "joint"),
     "prismatic": count("prismatic joints"),
     "torques": truth("whether torques of the joints follow their readings"),
+    "directions": truth("whether directions of approach of the joints follow"),
+    "load": truth("whether a load follows"),
     "thermometer": truth("whether the last column of the readings is the temperature"),
     "prior_groups": text("groups of parameters with a prior"),
     "prior_sd": number("standard deviation of each group with a prior, mm or rad", ""),

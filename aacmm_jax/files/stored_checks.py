@@ -3,6 +3,7 @@
 Nothing here needs JAX, so that ``aacmm show`` checks a file and prints the summary in it quickly.
 """
 
+import base64
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,6 +15,7 @@ from .records import check_fields
 from .schema import RECORDING, TABLES
 
 _ROUNDING = 1e-6  # of k
+_LARGEST_PICTURE = 1000  # px
 _LARGEST_U = 0.1  # of k: beyond it the scale is as good as unknown
 
 
@@ -46,7 +48,24 @@ def read_checked(path: str | os.PathLike, kinds: Sequence[str]) -> Stored:
             )
         if "points" in stored.tables:
             _check_points(path, stored.tables["points"])
+        previews = stored.tables.get("images", {}).get("preview", ())
+        check_sense(path, {"the picture of an image is not a small JPEG": not all(map(_is_preview, previews))})
     return stored
+
+
+def _is_preview(text: str) -> bool:
+    """Whether a picture is empty, or a JPEG whose header states a small size: a browser is to decode it."""
+    try:
+        content = base64.b64decode(text, validate=True)
+    except ValueError:
+        return False
+    at = 2
+    while content[:2] == b"\xff\xd8" and len(content) >= at + 9:
+        marker, length = content[at : at + 2], int.from_bytes(content[at + 2 : at + 4])
+        if marker in (b"\xff\xc0", b"\xff\xc2"):  # which begin the header of the picture
+            return max(int.from_bytes(content[i : i + 2]) for i in (at + 5, at + 7)) <= _LARGEST_PICTURE
+        at += 2 + length
+    return not content
 
 
 def check_shown(path: str | os.PathLike, kind: str, summary: Mapping[str, Any]) -> None:

@@ -12,7 +12,7 @@ from ..core.errors import InputError
 from ..core.text import csv_text, is_number, quoted
 from ..core.units import ANGLE_UNITS, DEG, LENGTH_UNITS
 from ..kinematics.arm import Arm, by_joint
-from .text_lines import Column, are_numbered, bare_name, stem_and_number
+from .text_lines import SI, Column, are_numbered, bare_name, stem_and_number
 from .text_table import TextTable
 
 # Words beside the number in the names of readings: q_1, joint 1, A1, axis_1, actual_q_0, /panda_joint1/position, ...
@@ -28,8 +28,13 @@ _NO_JOINT = re.compile("[xyzt]|time|timestamp|date|stamp|index|row|point|socket|
 # Universal Robots' joints in ROS, whose messages have them in alphabetical order.
 OF_UR = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 _POSITIONS = (("x", "y", "z"), ("px", "py", "pz"))
-TEMPERATURE = "temperature_C"  # the column of the arm's temperature
-TORQUE = "torque_{}_Nm"  # the columns of the joints' torques
+BESIDE = {  # the columns of what was recorded beside the joints' readings, with {} one a joint
+    "torques": "torque_{}_Nm",
+    "directions": "direction_{}",
+    "load": "load_kg",
+    "thermometer": "temperature_C",
+}
+TEMPERATURE = BESIDE["thermometer"]
 LINE = "columns = [{}]"  # what a manifest states; of commands it is an option
 
 
@@ -111,8 +116,8 @@ def reading_columns(
         _check_not_taken(table, columns, taken)
     if whole or not required:
         return whole[0] if whole else []
-    temperature = table.pick([TEMPERATURE]) if table.has([TEMPERATURE]) else []
-    free = [i for i in range(table.width) if i not in taken and i not in temperature]
+    beside = [i for name in (BESIDE["load"], TEMPERATURE) if table.has([name]) for i in table.pick([name])]
+    free = [i for i in range(table.width) if i not in taken and i not in beside]
     names = [bare_name(table.header[i]) for i in free if table.header]
     foreign = any(_NO_JOINT.fullmatch(word) for name in names for word in _words(name)[:1])
     if len(free) == joints and not foreign and not named and not (table.misnamed and are_numbered(table.title)):
@@ -182,6 +187,7 @@ def header_units(text: TextTable, picked: Sequence[int], arm: Arm, stated: str |
     units = []
     for joints, columns, possible, stated_unit in kinds:
         unit = text.unit(columns, stated_unit)
+        unit = {"revolute": "rad", "prismatic": "m"}[joints] if unit == SI else unit
         if unit not in (None, "counts", *possible):
             raise InputError(
                 f"{text.path} has readings of {joints} joints in {quoted(unit)} (column "

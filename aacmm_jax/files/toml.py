@@ -57,8 +57,6 @@ def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
         content = tomllib.loads(text)
     except InputError:
         raise
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not UTF-8 text; give a TOML file.") from error
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path} is not valid TOML: {error}; correct the file at this point.") from error
     except RecursionError as error:

@@ -1,4 +1,4 @@
-"""Robots in URDF: a serial chain read into an arm, and a calibrated arm written back into the user's own file."""
+"""Robots in URDF and MJCF: a serial chain read into an arm, and a calibrated arm written back into the user's file."""
 
 import math
 import os
@@ -30,12 +30,15 @@ from ..kinematics.axes_to_dh import (
 from ..kinematics.chain import JointKinds
 from ..kinematics.parameters import ArmSpecification, UrdfSource, single, with_tool
 from .inputs import InputFile
+from .mjcf import edited_mjcf, with_includes
+from .mjcf_text import parse_robot
 from .outputs import write_text
-from .urdf_text import Robot, UrdfJoint, edited, parse_urdf
+from .urdf_text import ExportedUrdf, Robot, UrdfJoint, edited, unused_name
 
 _REVOLUTION = (-2 * math.pi, 2 * math.pi)  # limits of a continuous joint: readings of -pi to pi and of 0 to 2 pi
 _LONGEST = 50_000.0  # mm; no serial chain is as long
 _LARGEST, _IN_DEGREES = 15.0, 720.0  # rad: limits of joints end below; those in degrees are mostly between
+_SAME_PLACE = 1e-9  # mm: a probe nearer to the tip link than this is no tool beyond it
 _LISTED = 12  # links that a message names
 
 
@@ -87,19 +90,10 @@ class LinkMasses(NamedTuple):
     centre: Float[np.ndarray, "n 3"]  # mm; 0 where there is no mass
 
 
-class ExportedUrdf(NamedTuple):
-    """A URDF with calibrated origins."""
-
-    text: str
-    tip: str  # the link whose origin is the calibrated tip
-    changed: tuple[str, ...]  # joints with another origin
-    notes: tuple[str, ...]  # what was added, in sentences
-
-
 def read_urdf(
     path: str | os.PathLike, *, base: str | None = None, tip: str | None = None, probe: Numbers | None = None
 ) -> ArmSpecification:
-    """The arm of a serial chain of a URDF, in the first D-H frame, with the text of the file; arguments as of
+    """The arm of a serial chain of a URDF or MJCF, in the first D-H frame, with the text of the file; arguments as of
     `load_arm`."""
     file = InputFile(path)
     with naming(path):
@@ -107,14 +101,26 @@ def read_urdf(
             text = file.content.decode("utf-8")
         except UnicodeDecodeError as error:
             raise InputError("the file is not UTF-8 text; save it as UTF-8.") from error
-        robot = parse_urdf(text)
+        text = with_includes(text, Path(file))
+        robot = parse_robot(text)
         source = UrdfSource(text, *_ends(robot, base, tip))
-        arm = urdf_chain(source).arm
-        return ArmSpecification(arm if probe is None else with_tool(arm, probe), Path(file).stem, urdf=source)
+        chain = urdf_chain(source)
+        arm = chain.arm if probe is None else with_tool(chain.arm, probe)
+        return ArmSpecification(arm, Path(file).stem, urdf=located(source, chain, arm))
+
+
+def located(source: UrdfSource, chain: UrdfChain, arm: Arm) -> UrdfSource:
+    """The same source with its links as seen from the frames of an arm, which may have a tool beyond the tip link."""
+    probe = np.asarray(chain.arm.probe)
+    without_tool = np.allclose(arm.probe, probe, rtol=0, atol=_SAME_PLACE)
+    first = tuple(map(tuple, chain.base.tolist()))
+    follows = chain.tip_joint is not None and without_tool
+    return source._replace(first=first, link=tuple(probe.tolist()), follows=follows)
 
 
 def urdf_chain(source: UrdfSource) -> UrdfChain:
-    """The chain between two links of a URDF as an arm; exact, whatever the directions of the axes.
+    """The chain between two links of a URDF, or between bodies and sites of MJCF, as an arm; exact, whatever the
+    directions of the axes.
 
     Args:
         source: The text of the file and the names of the links.
@@ -126,7 +132,7 @@ def urdf_chain(source: UrdfSource) -> UrdfChain:
         >>> print((chain.base @ chain.arm.pose([0.0, 0.0, 0.0]))[:3, 3].round(3), "mm")
         [750.   0. 300.] mm
     """
-    robot = parse_urdf(source.text)
+    robot = parse_robot(source.text)
     path = _joints_between(robot, source.base, source.tip)
     joints, before, frames, frame, fixed = [], [], [], np.eye(4), np.eye(4)
     for joint in path:
@@ -145,7 +151,7 @@ def urdf_chain(source: UrdfSource) -> UrdfChain:
     if length > _LONGEST:
         raise InputError(
             f"the chain from {quoted(source.base)} to {quoted(source.tip)} is {length / 1000:,.0f} m long, so its "
-            "lengths are probably in mm; a URDF uses m, so divide the lengths by 1000."
+            f"lengths are probably in mm; {robot.document.format.name} uses m, so divide the lengths by 1000."
         )
     *after, last = path[path.index(joints[-1]) :]
     tip_joint = last if last.kind == "fixed" else None
@@ -184,12 +190,13 @@ def link_masses(chain: UrdfChain) -> LinkMasses:
 
 
 def urdf_of(arm: Arm, nominal: ArmSpecification) -> ExportedUrdf:
-    """The user's URDF with the origins of a calibrated arm; comments, meshes, order and other numbers stay.
+    """The user's URDF or MJCF with the origins of a calibrated arm; comments, meshes, order and other numbers stay.
 
     The base link stays, and a joint's frame moves along its axis, and turns about it, no more than the calibration
     says: no data on the tip determine that. The zero offset of a prismatic joint shifts its frame along its axis. Where
     the arm has a tool beyond the tip link, or no fixed joint ends at the tip link, the calibrated tip is the origin of
-    a link that is added.
+    a link that is added. In MJCF, the bodies have the origins, sites are links, and files that were included stand in
+    the text.
 
     Args:
         arm: The calibrated arm.
@@ -203,52 +210,59 @@ def urdf_of(arm: Arm, nominal: ArmSpecification) -> ExportedUrdf:
     """
     if nominal.urdf is None:
         raise InputError(
-            "the nominal arm was not read from a URDF, so a URDF cannot be exported; choose --format toml."
+            "the nominal arm was not read from a URDF or MJCF, so a URDF cannot be exported; choose --format toml."
         )
     chain = urdf_chain(nominal.urdf)
     if single(arm).joints != len(chain.joints):
         raise InputError(
-            f"the arm has {arm.joints} joints, but the URDF has {len(chain.joints)}; give an arm that was calibrated "
-            "from this URDF."
+            f"the arm has {arm.joints} joints, but the chain has {len(chain.joints)}; give an arm that was "
+            "calibrated from this file."
         )
     before, after = geometry_of(chain.arm), geometry_of(arm)
-    origins: dict[str, dict[str, str]] = {}
-    frame, nominal_origins = np.eye(4), chain.origins
-    frames = calibrated_frames(nominal_origins, before, after, chain.base)
-    for joint, fixed, old, new in zip(chain.joints, chain.before, nominal_origins, frames, strict=True):
-        frame = frame @ new
-        if new is not old:
-            origins[joint.name] = _changed(inverse(fixed) @ new, joint.origin)
-    tip = tip_frame(after, chain.base)
+    frames = calibrated_frames(chain.origins, before, after, chain.base)
+    last = inverse(reduce(np.matmul, frames, np.eye(4)))
     tool = np.asarray(nominal.arm.probe) - np.asarray(chain.arm.probe)
-    has_tool = bool(np.linalg.norm(tool) > 1e-9)
+    has_tool = bool(np.linalg.norm(tool) > _SAME_PLACE)
+    tip = last @ tip_frame(after, chain.base)
     # A tool is no part of the file: the tip link then follows the last D-H frame alone.
-    link = tip_frame(after._replace(probe=before.probe), chain.base) if has_tool else tip
+    link = last @ tip_frame(after._replace(probe=before.probe), chain.base) if has_tool else tip
+    if nominal.urdf.format == "MJCF":
+        path = _joints_between(chain.robot, nominal.urdf.base, nominal.urdf.tip)
+        return edited_mjcf(nominal.urdf.text, chain.robot, path, frames, link, tip)
+    return _edited_urdf(nominal.urdf, chain, frames, link, tip)
+
+
+def _edited_urdf(
+    source: UrdfSource, chain: UrdfChain, frames: list[Transform], link: Transform, tip: Transform
+) -> ExportedUrdf:
+    """The text with other origins; ``link`` and ``tip`` as of `edited_mjcf`."""
+    origins: dict[str, dict[str, str]] = {}
+    for joint, fixed, new in zip(chain.joints, chain.before, frames, strict=True):
+        if values := _changed(inverse(fixed) @ new, joint.origin):
+            origins[joint.name] = values
     if chain.tip_joint is None:
-        link = frame @ chain.tip
-    elif not same_transform(frame @ chain.tip, link):
-        new = inverse(frame @ chain.tip_before) @ link
-        origins[chain.tip_joint.name] = _changed(new, chain.tip_joint.origin)
-    name, added, notes = nominal.urdf.tip, "", ()
+        link = chain.tip
+    elif not same_transform(chain.tip, link):
+        origins[chain.tip_joint.name] = _changed(inverse(chain.tip_before) @ link, chain.tip_joint.origin)
+    name, added, notes = source.tip, "", ()
     if not same_transform(link, tip):
-        robot, end = chain.robot, nominal.urdf.tip
-        names = (f"{end}_probe{suffix}" for suffix in ("", *range(2, 1000)))
-        name = next(name for name in names if name not in robot.links and f"{name}_joint" not in robot.joints)
+        joints = [joint.removesuffix("_joint") for joint in chain.robot.joints]
+        name = unused_name(f"{name}_probe", chain.robot.links, joints)
         origin = " ".join(f'{key}="{text}"' for key, text in _attributes(inverse(link) @ tip).items())
         added = (
             f"  <link name={quoteattr(name)}/>\n"
             f'  <joint name={quoteattr(name + "_joint")} type="fixed">\n'
-            f"    <parent link={quoteattr(end)}/>\n"
+            f"    <parent link={quoteattr(source.tip)}/>\n"
             f"    <child link={quoteattr(name)}/>\n"
             f"    <origin {origin}/>\n"
             "  </joint>\n"
         )
         notes = (f"the calibrated tip is the origin of the link {quoted(name)}, which was added to the URDF.",)
-    return ExportedUrdf(edited(nominal.urdf.text, origins, chain.robot, added), name, tuple(origins), notes)
+    return ExportedUrdf(edited(source.text, origins, chain.robot, added), name, tuple(origins), notes)
 
 
 def save_urdf(arm: Arm, path: str | os.PathLike, *, nominal: ArmSpecification) -> ExportedUrdf:
-    """Write the user's URDF with the origins of a calibrated arm, as `urdf_of` makes it.
+    """Write the user's URDF or MJCF with the origins of a calibrated arm, as `urdf_of` makes it.
 
     Args:
         arm: The calibrated arm.
@@ -285,7 +299,7 @@ def _check_moving(joint: UrdfJoint) -> None:
     """Refuse a joint that an arm does not have."""
     what, slides = f"joint {quoted(joint.name)}", joint.kind == "prismatic"
     if joint.kind not in ("revolute", "continuous", "prismatic"):
-        of_format = joint.kind in ("floating", "planar")
+        of_format = joint.kind in ("floating", "planar", "spherical")
         kind = f"is {joint.kind}" if of_format else f"has the unknown type {quoted(joint.kind)}"
         raise InputError(
             f"{what} {kind}, which cannot be part of an arm; choose links without this joint between them."
@@ -299,18 +313,17 @@ def _check_moving(joint: UrdfJoint) -> None:
         raise InputError(f"{what} has an axis of length 0; correct <axis xyz=...> of the joint.")
     if joint.kind == "continuous":
         return
-    unit, factor, other = ("m", 1e-3, "") if slides else ("rad", 1.0, ', or type="continuous"')
+    unit, factor = ("m", 1e-3) if slides else ("rad", 1.0)
+    limit = f"<limit lower=... upper=...> in {unit}" if joint.place is None else "range=..."
+    other = "" if slides or joint.place is not None else ', or type="continuous"'
     limits = [f"{factor * limit:g}" for limit in joint.limits or ()]
     if joint.limits is None or not joint.limits[0] < joint.limits[1]:
         state = f"has the limits {' and '.join(limits)} {unit}" if limits else "has no limits"
-        raise InputError(
-            f"{what} is {joint.kind} and {state}; add <limit lower=... upper=...> in {unit}, with lower below "
-            f"upper{other}."
-        )
+        raise InputError(f"{what} is {joint.kind} and {state}; add {limit}, with lower below upper{other}.")
     if not slides and _LARGEST < max(map(abs, joint.limits)) <= _IN_DEGREES:
         raise InputError(
-            f"{what} has the limits {' and '.join(limits)} rad, which are probably in degrees; a URDF uses rad, so "
-            "convert the limits."
+            f"{what} has the limits {' and '.join(limits)} rad, which are probably in degrees, but the "
+            "file states rad; convert the limits."
         )
 
 
@@ -356,14 +369,14 @@ def _ends(robot: Robot, base: str | None, tip: str | None) -> tuple[str, str]:
     for what, link in (("base", base), ("tip", tip)):
         if link is not None and link not in robot.links:
             raise InputError(
-                f"the URDF has no link {quoted(link)} for the {what}; its links are {_listed(robot.links)}."
+                f"the file has no link {quoted(link)} for the {what}; its links are {_listed(robot.links)}."
             )
     if base is None and tip is not None and (back := _joints_before(robot, tip)):
         base = back[-1].parent
     if base is None:
         roots = [link for link in robot.links if link not in robot.joint_before]
         if not robot.links:
-            raise InputError("the URDF has no <link>; give the URDF of a robot.")
+            raise InputError("the file has no <link>; give the file of a robot.")
         if not roots:
             raise InputError(
                 "every link has a joint before it, so the joints form a loop; a URDF must be a tree, so correct the "
@@ -371,13 +384,14 @@ def _ends(robot: Robot, base: str | None, tip: str | None) -> tuple[str, str]:
             )
         if len(roots) > 1:
             raise InputError(
-                f"the URDF has {len(roots)} root links, {_listed(roots)}; choose the base (base= or --base)."
+                f"the file has {len(roots)} root links, {_listed(roots)}; choose the base (base= or --base)."
             )
         base = roots[0]
     if tip is not None:
         return base, tip
-    tips, inner = [], {joint.parent for joint in robot.joints.values()}
-    for link in (link for link in robot.links if link not in inner):
+    bodies = [joint for joint in robot.joints.values() if joint.element.name != "site"]
+    tips, inner = [], {joint.parent for joint in bodies}
+    for link in (joint.child for joint in bodies if joint.child not in inner):
         back = _joints_before(robot, link)
         parents = [joint.parent for joint in back]
         if base in parents and any(joint.kind != "fixed" for joint in back[: parents.index(base) + 1]):
@@ -385,7 +399,7 @@ def _ends(robot: Robot, base: str | None, tip: str | None) -> tuple[str, str]:
     if not tips:
         raise InputError(f"there is no moving joint after {quoted(base)}; choose another base (base= or --base).")
     if len(tips) > 1:
-        raise InputError(f"the URDF has several chains, which end at {_listed(tips)}; choose the tip (tip= or --tip).")
+        raise InputError(f"the file has several chains, which end at {_listed(tips)}; choose the tip (tip= or --tip).")
     return base, tips[0]
 
 

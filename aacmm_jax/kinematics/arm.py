@@ -16,6 +16,7 @@ from ..core.arrays import Numbers, as_array, as_floats
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, in_chunks, namespace, numpy_if_known, to_jax, to_numpy
 from ..core.text import pluralise
+from .beside import COLUMNS, Beside, extras
 from .chain import Corrections, Geometry, JointKinds, tip_pose
 from .jacobian import Indices, tip_jacobian, tip_position
 
@@ -52,6 +53,10 @@ class Arm(eqx.Module):
         corrections: What joints do besides their readings; `kinematics.with_corrections` makes them.
         torques: Whether readings have n more columns after those of the joints: the torques of their drives, N m (N of
             prismatic joints), of which only corrections by torques make use. Not of an arm with a single joint.
+        directions: Whether n more columns follow: 1 where the joint reached the pose with rising readings, -1 with
+            falling ones, 0 where it is unknown; for backlash.
+        load: Whether one more column follows: the mass at the tip, kg, besides that of the arm and its tool; 0 where it
+            is missing.
         thermometer: Whether readings have one more, last column: the temperature of the arm, C, of which only thermal
             expansion makes use. Where it is missing, the arm is taken to be at 20 C.
 
@@ -74,8 +79,7 @@ class Arm(eqx.Module):
     coefficients: Float[AnyArray, "... k"] | None
     gravity: Float[AnyArray, "... 3"] | None
     corrections: Corrections | None
-    torques: bool = eqx.field(static=True)
-    thermometer: bool = eqx.field(static=True)
+    recorded: tuple[str, ...] = eqx.field(static=True)  # which of `beside.COLUMNS` readings are stated to have
 
     def __init__(
         self,
@@ -92,6 +96,8 @@ class Arm(eqx.Module):
         gravity: Numbers | None = None,
         corrections: Corrections | None = None,
         torques: bool = False,
+        directions: bool = False,
+        load: bool = False,
         thermometer: bool = False,
     ):
         sizes: dict[str, int] = {}
@@ -123,10 +129,10 @@ class Arm(eqx.Module):
         numbers = checked(prismatic, Sequence[Annotated[int, Range(1, self.joints)]], "prismatic")
         self.prismatic = tuple(sorted({int(number) for number in numbers}))
         self.limits = None if limits is None else checked_limits(limits, self.joints, self.prismatic)
-        self.torques = bool(torques) or (corrections is not None and corrections.functions.by_torque)
-        if self.torques and self.joints == 1:
+        given = dict(zip(COLUMNS, (torques, directions, load, thermometer), strict=True))
+        self.recorded = tuple(name for name in COLUMNS if given[name])
+        if "torques" in self.beside.possible and self.joints == 1:
             raise InputError("torques need an arm with at least two joints; create the arm without torques.")
-        self.thermometer = bool(thermometer) or (corrections is not None and corrections.functions.expands)
 
     @property
     def joints(self) -> int:
@@ -134,15 +140,21 @@ class Arm(eqx.Module):
         return self.alpha.shape[-1]
 
     @property
+    def beside(self) -> Beside:
+        """Which columns readings may have after those of the joints: those stated, and those that corrections read."""
+        read = () if self.corrections is None else self.corrections.functions.columns
+        possible = tuple(name for name in COLUMNS if name in read or name in self.recorded) if read else self.recorded
+        return Beside(self.joints, self.recorded, possible)
+
+    @property
     def columns(self) -> int:
-        """Number of columns of readings: the joints, their torques and the thermometer where there are such."""
-        return self.joints * (1 + self.torques) + self.thermometer
+        """Number of columns of readings, with everything that may be recorded beside the joints."""
+        return self.beside.width(self.beside.possible)
 
     @property
     def possible_columns(self) -> tuple[int, ...]:
-        """Numbers of columns that readings may have: torques and temperatures may be missing."""
-        beside = {0, self.joints * self.torques}
-        return tuple(sorted({self.joints + more + last for more in beside for last in {0, int(self.thermometer)}}))
+        """Numbers of columns that readings may have: what is recorded beside the joints may be missing."""
+        return self.beside.widths
 
     @property
     def geometry(self) -> Geometry:
@@ -150,7 +162,11 @@ class Arm(eqx.Module):
         prismatic = self.prismatic  # read once: Equinox looks attributes up in Python
         kinds = JointKinds(tuple(i in prismatic for i in range(1, self.joints + 1))) if prismatic else None
         corrected = (self.coefficients, self.gravity, self.corrections)
-        return Geometry(self.alpha, self.a, self.d, self.theta, self.beta, self.probe, kinds, *corrected)
+        beside = self.beside
+        return Geometry(
+            *(self.alpha, self.a, self.d, self.theta, self.beta, self.probe, kinds, *corrected),
+            beside=beside if beside.possible else None,
+        )
 
     def position(self, q: Numbers) -> Float[AnyArray, "... 3"]:
         """Tip in the base frame, mm, at readings q, rad, or mm of prismatic joints: ``(..., n) -> (..., 3)``."""
@@ -178,8 +194,9 @@ class Arm(eqx.Module):
         By parameter name (``d_3=750.0``), or a whole argument of the constructor (``probe=(0, 0, 131)``); mm and rad. A
         single parameter is set after whole arguments.
         """
-        whole = [field.name for field in dataclasses.fields(self)]
+        whole = [field.name for field in dataclasses.fields(self) if field.name != "recorded"]
         arguments: dict[str, Any] = {name: changes.pop(name, getattr(self, name)) for name in whole}
+        arguments |= {name: changes.pop(name, name in self.recorded) for name in COLUMNS}
         for name, value in changes.items():
             kind, i = locate(self, name)
             array = np.zeros(self.alpha.shape) if arguments[kind] is None else as_floats(arguments[kind], kind)
@@ -204,10 +221,9 @@ def checked_readings(arm: Arm, q: Numbers, like: AnyArray | None = None) -> Floa
     """Readings as an array like the arm's or another, or `InputError` where they do not have the arm's columns."""
     array, joints = as_array(q, "q", like=arm.alpha if like is None else like), arm.joints
     if array.ndim == 0 or array.shape[-1] not in arm.possible_columns:
-        other = ", their torques" * arm.torques + ", and a thermometer" * arm.thermometer
         raise InputError(
-            f"q has shape {array.shape}, but the arm has {joints} joints{other}; the last axis must run over the "
-            "joints."
+            f"q has shape {array.shape}, but the arm has {joints} joints{extras(arm.beside.possible)}; the last axis "
+            "must run over the joints."
         )
     return array
 
@@ -216,15 +232,15 @@ def check_columns(arm: Arm, columns: int) -> None:
     """Raise `InputError` where readings of a capture have not the columns of an arm; without temperatures it was at
     20 C."""
     if columns not in arm.possible_columns:
-        temperature = ", and the temperature in the last column" if arm.thermometer else ""
+        other = extras(arm.beside.possible)
         if columns == arm.joints + 1:
-            temperature = ", or use an arm with thermometer=True if the last column is the temperature"
-        elif columns >= 2 * arm.joints and not arm.torques:
-            temperature = ", or use an arm with torques=True if columns of torques follow"
+            other = ", or use an arm with thermometer=True if the last column is the temperature"
+        elif columns >= 2 * arm.joints and "torques" not in arm.beside.possible:
+            other = ", or use an arm with torques=True if columns of torques follow"
         raise InputError(
-            f"the capture has {columns} columns, but the arm has {arm.joints} joints; give one column per "
-            f"joint{temperature}."
+            f"the capture has {columns} columns, but the arm has {arm.joints} joints; give one column per joint{other}."
         )
+    arm.beside.names(columns)
 
 
 def checked_limits(limits: Limits, joints: int, prismatic: tuple[int, ...] = ()) -> tuple[tuple[float, float], ...]:
@@ -263,8 +279,10 @@ def joint_limits(arm: Arm, limits: Limits | None) -> JointLimits:
 def arm_of(geometry: Geometry, limits: Limits | None = None) -> Arm:
     """The arm of a geometry."""
     prismatic = () if geometry.kinds is None else geometry.kinds.prismatic
-    arrays = {name: value for name, value in geometry._asdict().items() if name != "kinds"}
-    return Arm(**arrays, limits=limits, prismatic=[i for i, slides in enumerate(prismatic, start=1) if slides])
+    arrays = {name: value for name, value in geometry._asdict().items() if name not in ("kinds", "beside")}
+    slides = [i for i, slides in enumerate(prismatic, start=1) if slides]
+    arm = Arm(**arrays, limits=limits, prismatic=slides)
+    return arm if geometry.beside is None else reading_as(arm, geometry.beside.recorded)
 
 
 def by_joint(arm: Arm, angular: Any, linear: Any) -> list[Any]:
@@ -278,14 +296,20 @@ def readings_unit(arm: Arm) -> str:
     return "rad, mm of prismatic joints" if arm.prismatic else "rad"
 
 
+def reading_as(arm: Arm, recorded: Iterable[str]) -> Arm:
+    """The same arm, whose readings have exactly these of `beside.COLUMNS`, and what its corrections read."""
+    recorded = tuple(recorded)
+    return arm.replace(**{name: name in recorded for name in COLUMNS})
+
+
 def is_single(arm: Arm) -> bool:
     """Whether this is one arm and not a batch."""
     return all(array.ndim == 1 for array in jax.tree.leaves(arm.geometry))
 
 
 def without_corrections(arm: Arm) -> Arm:
-    """The arm whose joints do what they read."""
-    return arm.replace(coefficients=None, gravity=None, corrections=None)
+    """The arm whose joints do what they read; its readings may have the columns that its corrections read."""
+    return reading_as(arm.replace(coefficients=None, gravity=None, corrections=None), arm.beside.possible)
 
 
 def parameter_names(arm: Arm) -> tuple[str, ...]:

@@ -20,7 +20,7 @@ from .independence import NEARLY_PARALLEL
 Vector = Float[np.ndarray, " 3"]
 Transform = Float[np.ndarray, "4 4"]
 _NO_LENGTH, _NO_ANGLE = 1e-12, 1e-15  # mm and rad: below the rounding of a chain of some metres
-_UNCHANGED = 2e-11, 2e-14  # mm and rad: far above the rounding of a round trip, far below 1e-9 mm at any tip
+UNCHANGED = 2e-11, 2e-14  # mm and rad: far above the rounding of a round trip, far below 1e-9 mm at any tip
 
 
 class Axes(NamedTuple):
@@ -51,7 +51,7 @@ def inverse(transform: Transform) -> Transform:
 
 def same_transform(first: Transform, second: Transform) -> bool:
     """Whether two transforms are the same to rounding."""
-    (length, angle), difference = _UNCHANGED, np.abs(first - second)
+    (length, angle), difference = UNCHANGED, np.abs(first - second)
     return bool(difference[:3, 3].max() <= length and difference[:3, :3].max() <= angle)
 
 

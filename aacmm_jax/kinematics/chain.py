@@ -27,6 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, scan, set_at
+from .beside import Beside, Readings
 
 Vectors = Float[AnyArray, "... 3 N"]
 ByJoint = Float[AnyArray, "n ... 3 N"]  # a vector of each joint
@@ -73,7 +74,7 @@ class KnownFunctions:
     def __hash__(self) -> int:
         return hash(self.names)  # kept: every call of a compiled program asks for it
 
-    def values(self, q: Float[AnyArray, "n ... 1 N"], forward: Any) -> Float[AnyArray, "rows ... 1 N"]:
+    def values(self, q: Readings, forward: Any) -> Float[AnyArray, "rows ... 1 N"]:
         """All rows at N configurations, with the nominal arm's forward pass there; neighbours of one kind together."""
         runs = [tuple(run) for _, run in groupby(self.terms, key=lambda term: type(term.kind))]
         values, xp = [run[0].kind.values(run, q, forward) for run in runs], namespace(q, forward)
@@ -109,10 +110,10 @@ class KnownFunctions:
         terms = enumerate(self.terms)
         return tuple((b, term.number - 1, term.joint - 1) for b, term in terms if term.kind.of_other_reading)
 
-    @property
-    def by_torque(self) -> bool:
-        """Whether some function is the torque of a joint."""
-        return any(term.kind.of_torque for term in self.terms)
+    @cached_property
+    def columns(self) -> frozenset[str]:
+        """Which of `beside.COLUMNS` the functions read."""
+        return frozenset(term.kind.column for term in self.terms if term.kind.column)
 
     @property
     def expands(self) -> bool:
@@ -151,6 +152,7 @@ class Geometry(NamedTuple):
     coefficients: Float[AnyArray, "... k"] | None = None  # of the corrections' functions
     gravity: Float[AnyArray, "... 3"] | None = None  # its direction in the base frame
     corrections: Corrections | None = None  # None where joints do what they read
+    beside: Beside | None = None  # what readings have beside those of the joints; None for nothing
 
 
 class JointMotion(NamedTuple):
@@ -198,14 +200,8 @@ def reading_units(geometry: Geometry) -> Float[np.ndarray, " n"]:
     return np.ones(geometry.alpha.shape[-1]) if geometry.kinds is None else geometry.kinds.units
 
 
-def beside_joints(joints: int, columns: int) -> tuple[slice, slice]:
-    """Which columns of readings, after those of the joints, are their torques, and which one is the temperature."""
-    torques = joints if 1 < joints <= columns - joints else 0
-    return slice(joints, joints + torques), slice(joints + torques, joints + torques + 1)
-
-
 def of_joints(geometry: Geometry, rows: Float[AnyArray, "columns ..."]) -> Float[AnyArray, "n ..."]:
-    """The readings of the joints alone, which come first, without torques and temperature."""
+    """The readings of the joints alone, which come first, without what was recorded beside them."""
     joints = geometry.alpha.shape[-1]
     return rows if rows.shape[0] == joints else rows[:joints]
 
@@ -215,7 +211,7 @@ def joint_motion(geometry: Geometry, q: Float[AnyArray, "... n"]) -> JointMotion
 
     Cosines and sines are half of the time of a forward pass. Of the geometry, only what an identification does not
     change matters: the kinds of the joints, and the nominal arm of its corrections. ``q`` is ``(..., n)``, rad, or mm
-    of prismatic joints; torques and the temperature follow where they were recorded (`beside_joints`).
+    of prismatic joints; what was recorded beside them follows (`beside`).
     """
     return joint_motion_of_rows(geometry, joints_first(q, max(q.ndim - 1, 1)))
 
@@ -238,7 +234,8 @@ def joint_motion_of_rows(geometry: Geometry, rows: Float[AnyArray, "n ... 1 N"])
         whole = full_couplings(functions, joints_first(geometry.coefficients, rows.ndim - 2))
         nominal = geometry._replace(coefficients=None, gravity=None, corrections=None)
         moved = joint_motion_of_rows(nominal, coupled_joints(functions, whole, readings))
-    return motion._replace(functions=functions.values(rows, forward_pass(corrections.nominal, moved)))
+    recorded = Readings(readings) if geometry.beside is None else geometry.beside.split(rows)
+    return motion._replace(functions=functions.values(recorded, forward_pass(corrections.nominal, moved)))
 
 
 def full_couplings(functions: KnownFunctions, coefficients: Float[AnyArray, "k ..."]) -> Float[AnyArray, "c ..."]:

@@ -11,13 +11,12 @@ from ..core.errors import InputError
 from ..core.linear_algebra import independent_columns
 from ..core.numpy_or_jax import namespace, to_numpy
 from .arm import DOWN, Arm, correction_names, is_single, joint_limits, without_corrections
+from .beside import ALL, Beside
 from .chain import Corrections, Geometry, KnownFunctions, forward_pass, joint_motion, joints_first
 from .correction_kinds import KILO, Loads, Term, Torque
 from .corrections import term_of, terms_of
 
 _CONFIGURATIONS = 300
-_TEMPERATURES = (10.0, 30.0)  # C
-_TORQUES = (-100.0, 100.0)  # N m
 _INDEPENDENT = 1e-6  # of a function's size: what must be left of it beside the constant and those before it
 
 
@@ -83,12 +82,11 @@ def _determined(arm: Arm, terms: Sequence[Term], gravity: Float[np.ndarray, " 3"
     """The terms whose functions are no combination of a constant and of those before them, joint by joint."""
     if not terms:
         return ()
-    limits = np.concatenate([joint_limits(arm, None), [_TEMPERATURES]])
-    q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_CONFIGURATIONS, arm.joints + 1))
-    if any(term.kind.of_torque for term in terms):
-        torques = np.random.default_rng(1).uniform(*_TORQUES, (_CONFIGURATIONS, arm.joints))
-        q = np.concatenate([q[:, :-1], torques, q[:, -1:]], axis=1)
-    values, chosen = function_values(arm.geometry, terms, q, gravity), []
+    beside, random = Beside(arm.joints, ALL, ALL), np.random.default_rng(0)
+    low, high = joint_limits(arm, None).T
+    q = random.uniform(low, high, (_CONFIGURATIONS, arm.joints))
+    q = np.hstack([q, beside.drawn(_CONFIGURATIONS, random)])
+    values, chosen = _values(arm.geometry._replace(beside=beside), terms, q, gravity), []
     constant = np.full((_CONFIGURATIONS, 1), _CONFIGURATIONS**-0.5)
     for joint in range(arm.joints + 1):  # 0: functions that scale all lengths
         numbers = np.array([number for number, term in enumerate(terms) if term.joint == joint], dtype=int)
@@ -97,12 +95,20 @@ def _determined(arm: Arm, terms: Sequence[Term], gravity: Float[np.ndarray, " 3"
     return tuple(terms[number] for number in sorted(chosen))
 
 
-def function_values(
-    nominal: Geometry, terms: Sequence[Term], q: Float[np.ndarray, "N n"], gravity: Float[np.ndarray, " 3"]
+def function_values(arm: Arm, terms: Sequence[Term], q: Float[np.ndarray, "N columns"]) -> Float[np.ndarray, "k N"]:
+    """The function of each term at N configurations, in units of its coefficient's effect (rad, or mm): on the frames
+    of the nominal arm of its corrections, or of the arm itself where it has none."""
+    nominal = arm.geometry if arm.corrections is None else arm.corrections.nominal
+    gravity = np.asarray(DOWN if arm.gravity is None else arm.gravity)
+    return _values(nominal._replace(beside=arm.beside), terms, q, gravity)
+
+
+def _values(
+    nominal: Geometry, terms: Sequence[Term], q: Float[np.ndarray, "N columns"], gravity: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "k N"]:
-    """The function of each term at N configurations, in units of its coefficient's effect (rad, or mm)."""
-    functions = KnownFunctions(tuple(terms))
-    rows = functions.values(joints_first(q, 1), forward_pass(nominal, joint_motion(nominal, q)))[:, 0]
+    assert nominal.beside is not None
+    functions, readings = KnownFunctions(tuple(terms)), nominal.beside.split(joints_first(q, 1))
+    rows = functions.values(readings, forward_pass(nominal, joint_motion(nominal, q)))[:, 0]
     weight = np.concatenate([gravity if by_gravity else [1.0] for by_gravity in functions.by_gravity])
     return np.add.reduceat(weight[:, None] * rows, functions.first_row)
 
@@ -148,8 +154,8 @@ def holding_torques(arm: Arm, q: Float[np.ndarray, "N n"]) -> Float[np.ndarray, 
             "the torques of poses that were not recorded follow from masses, but the masses are unknown; create the "
             "arm by with_corrections(arm, 'torque', mass=..., centre=...), or without torques."
         )
-    terms, down = Torque().terms(arm.joints, "", loads), np.asarray(DOWN)
-    return function_values(arm.corrections.nominal, terms, q, down).T / KILO
+    upright = arm.replace(gravity=DOWN)
+    return function_values(upright, Torque().terms(arm.joints, "", loads), q[:, : arm.joints]).T / KILO
 
 
 def loads_of(arm: Arm) -> Loads | None:

@@ -18,7 +18,8 @@ from jaxtyping import Float
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace
 from ..core.rotations import cross
-from .chain import ForwardPass, beside_joints, frame_axes
+from .beside import Readings
+from .chain import ForwardPass, frame_axes
 
 REFERENCE_TEMPERATURE = 20.0  # C, by ISO 1
 _HIGHEST = 99  # order of a harmonic
@@ -27,7 +28,6 @@ _METRE = 1e-3  # m/mm
 KILO = 1e-3  # kN/N: with rad/(kN m), compliances are about as large as errors of angles
 _MASSES = "masses"
 
-Readings = Float[AnyArray, "n ... 1 N"]
 Rows = Float[AnyArray, "rows ... 1 N"]
 
 
@@ -64,7 +64,7 @@ class AbstractCorrection(abc.ABC):
     of_arm: ClassVar[bool] = False  # whether it scales all lengths of the arm: its terms are of joint 0
     of_own_reading: ClassVar[bool] = False  # whether each function is of its joint's reading alone, and can be drawn
     of_other_reading: ClassVar[bool] = False  # whether each function is the reading of the joint that `Term.number` is
-    of_torque: ClassVar[bool] = False  # whether each function is the torque of its joint, where it was recorded
+    column: ClassVar[str] = ""  # which of `beside.COLUMNS` its functions read, where it was recorded
     has_options: ClassVar[bool] = False  # whether a model may say more of it, as harmonics=1-3 does
     sought: ClassVar[tuple[Sought, ...]] = ()  # what residuals of a calibration without it are searched for
     shared: ClassVar[str | None] = None  # option of the model whose functions poses may share errors by; None: none
@@ -87,8 +87,8 @@ class AbstractCorrection(abc.ABC):
 
     @abc.abstractmethod
     def values(self, terms: Sequence["Term"], q: Readings, forward: ForwardPass) -> Rows:
-        """The functions of terms of this kind, one after the other, `rows` of each: at readings, rad (mm of prismatic
-        joints; joints first, that of a thermometer, C, last), where the nominal arm has the frames ``forward``, mm."""
+        """The functions of terms of this kind, one after the other, `rows` of each: at readings, where the nominal arm
+        has the frames ``forward``, mm."""
 
 
 class Term(NamedTuple):
@@ -108,7 +108,7 @@ class Term(NamedTuple):
     @property
     def takes_masses(self) -> bool:
         """Whether its function is computed with the masses of all links, if they are known."""
-        return not self.number and (self.kind.rows == 3 or self.kind.of_torque)
+        return not self.number and (self.kind.rows == 3 or self.kind.column == "torques")
 
     @property
     def unit(self) -> str:
@@ -180,7 +180,7 @@ class Harmonics(AbstractCorrection):
 
     def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
         xp, joints = namespace(q), sorted({term.joint for term in terms})
-        readings = q[np.array(joints) - 1]
+        readings = q.joints[np.array(joints) - 1]
         cos, sin = xp.cos(readings)[None], xp.sin(readings)[None]
         highest = max(term.number for term in terms)
         while len(cos) < highest:
@@ -206,7 +206,7 @@ class GearRatio(AbstractCorrection):
     shared = ""
 
     def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
-        return q[np.array([term.joint - 1 for term in terms])]
+        return q.joints[np.array([term.joint - 1 for term in terms])]
 
 
 class Coupling(AbstractCorrection):
@@ -247,7 +247,7 @@ class Coupling(AbstractCorrection):
         return "must name another joint (use gear for a joint's own reading)" if term.number == term.joint else ""
 
     def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
-        return q[np.array([term.number - 1 for term in terms])]
+        return q.joints[np.array([term.number - 1 for term in terms])]
 
 
 class Gravity(AbstractCorrection):
@@ -327,6 +327,7 @@ class Expansion(AbstractCorrection):
     unit = "1/K"
     usual_size = 2e-5
     of_arm = True
+    column = "thermometer"
     sought = (Sought("thermal expansion", "", "temperature", "an arm that expands"),)
 
     def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
@@ -336,8 +337,7 @@ class Expansion(AbstractCorrection):
         return "applies to the whole arm, so its name must have no number" if term.number or term.joint else ""
 
     def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
-        temperature = q[beside_joints(len(forward.x), q.shape[0])[1]]
-        return temperature - REFERENCE_TEMPERATURE if len(temperature) else 0.0 * q[:1]
+        return 0.0 * q.joints[:1] if q.thermometer is None else q.thermometer - REFERENCE_TEMPERATURE
 
 
 class Torque(AbstractCorrection):
@@ -355,17 +355,16 @@ class Torque(AbstractCorrection):
     unit = "rad/(kN m)"
     usual_size = 1e-2  # 1 mrad for 100 N m
     usual_of_slide = 0.5
-    of_torque = True
+    column = "torques"
 
     def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
         return tuple(Term(self, "torque", 0, joint, loads) for joint in range(1, joints + 1))
 
     def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
         numbers = np.array([term.joint - 1 for term in terms])
-        torques = q[beside_joints(len(forward.x), q.shape[0])[0]]
-        if len(torques):
-            return KILO * torques[numbers]
+        if q.torques is not None:
+            return KILO * q.torques[numbers]
         if terms[0].loads is None:
-            return 0.0 * q[numbers]
+            return 0.0 * q.joints[numbers]
         # Gravity points along -z: what holds the arm has the opposite sign, that of the moments' last component.
         return Gravity().values(terms, q, forward)[2::3]

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from ..core.arrays import Numbers, as_array
 from ..core.errors import InputError
 from ..core.linear_algebra import solve_positive_definite
-from ..core.numpy_or_jax import AnyArray, compiled, in_chunks, namespace, numpy_if_known, set_at, to_numpy
+from ..core.numpy_or_jax import AnyArray, compiled, in_chunks, namespace, numpy_if_known, to_numpy
 from ..core.random_keys import random_numbers
 from ..core.rotations import cross
 from .arm import Arm, JointLimits, Limits, checked_limits, is_single
@@ -30,7 +30,7 @@ from .chain import (
     forward_pass,
     joint_motion,
     joint_motion_of_rows,
-    length_scale,
+    of_joints,
     reading_units,
 )
 from .jacobian import reading_columns, reading_rotations
@@ -83,20 +83,21 @@ def repeated(
 @compiled(jit=partial(jax.jit, static_argnames=("steps",)))
 def solve_to_targets(
     geometry: Geometry,
-    q: Float[AnyArray, "c n"],
+    q: Float[AnyArray, "c columns"],
     targets: Float[AnyArray, "c 3"],
     limits: Float[AnyArray, "n 2"],
     steps: int = _STEPS,
-) -> tuple[Float[AnyArray, "c n"], Float[AnyArray, " c"]]:
+) -> tuple[Float[AnyArray, "c columns"], Float[AnyArray, " c"]]:
     """Damped least-norm steps to the targets, within the limits, of at most 0.5 rad a joint; for any jit, vmap or loop.
 
-    Returned are the joint readings ``(c, n)``, rad or mm, and the final distances from the targets ``(c,)``, mm. A
+    Returned are the readings ``(c, columns)``, rad or mm, and the final distances from the targets ``(c,)``, mm. A
     slide of 1 mm counts as a rotation of 1 mrad (`JointKinds.units`). In NumPy a row does not depend on the others; in
     JAX all go on until the last has arrived.
 
     Args:
         geometry: The arm's ``geometry``.
-        q: Joint readings to begin with ``(c, n)``, rad, or mm of prismatic joints.
+        q: Joint readings to begin with ``(c, n)``, rad, or mm of prismatic joints; what was recorded beside them stays
+            as it is.
         targets: Positions of the tip, one each ``(c, 3)``, mm.
         limits: Lowest and highest reading of each joint ``(n, 2)``, rad or mm.
         steps: Most steps.
@@ -116,7 +117,9 @@ def solve_to_targets(
         gap = wanted - forward.tip
         inverse = weighted_inverse(forward, 1e-2 * xp.sum(gap**2, axis=0) + 1e-12)
         change = xp.sum(inverse * gap[None], axis=1, keepdims=True)
-        return xp.clip(q + xp.clip(change, -largest, largest), low, high), xp.any(xp.abs(gap) > EXACT, axis=0)
+        joints = xp.clip(of_joints(geometry, q) + xp.clip(change, -largest, largest), low, high)
+        q = joints if len(q) == len(joints) else xp.concatenate([joints, q[len(joints) :]])
+        return q, xp.any(xp.abs(gap) > EXACT, axis=0)
 
     # The step after the gap was seen to be closed takes what Newton's method leaves to rounding.
     q = repeated(step, q.T[:, None, :], [targets.T], steps, together=True)
@@ -202,8 +205,8 @@ def project_to_targets(
 
     Args:
         arm: The arm.
-        q: Joint readings to begin with ``(N, n)``, rad, or mm of prismatic joints; torques and temperatures stay as
-            they are.
+        q: Joint readings to begin with ``(N, n)``, rad, or mm of prismatic joints; what was recorded beside them
+            stays as it is.
         targets: Positions of the tip, one each ``(N, 3)``, mm.
         limits: Lowest and highest reading of each joint ``(n, 2)``, rad or mm; by default none.
         steps: Most steps of each configuration.
@@ -219,10 +222,8 @@ def project_to_targets(
     def moved(rows: np.ndarray) -> np.ndarray:
         return np.column_stack(solve_to_targets(geometry, rows[:, :-3], rows[:, -3:], allowed, steps))
 
-    # An arm that has expanded is at the target where the arm at 20 C is at the target divided by the scale of lengths.
-    joints, temperature = q[:, : arm.joints], q[:, arm.joints :]
-    solved = in_chunks(moved, np.hstack([joints, targets / length_scale(geometry, q)[:, None]]), ROWS)
-    return np.hstack([solved[:, :-1], temperature]), solved[:, -1] <= ARRIVED
+    solved = in_chunks(moved, np.hstack([q, targets]), ROWS)
+    return solved[:, :-1], solved[:, -1] <= ARRIVED
 
 
 def project_to_centroids(arm: Arm, capture: SocketPoses, targets_of: Arm | None = None) -> Float[np.ndarray, "N n"]:
@@ -289,8 +290,7 @@ def readings_at_poses(
 
     Args:
         arm: One arm.
-        q: Readings to begin with ``(..., n)``, rad; ``(..., n + 1)`` with the temperature of an arm with a
-            thermometer, C.
+        q: Readings to begin with ``(..., n)``, rad, with what was recorded beside them, which stays as it is.
         poses: The pose wanted for each, with the tip (mm) as its origin, in the arm's base frame ``(..., 4, 4)``.
         limits: Lowest and highest reading of each joint, n pairs, rad; by default none.
 
@@ -313,26 +313,24 @@ def readings_at_poses(
     if limits is not None:
         allowed = np.asarray(checked_limits(limits, n, arm.prismatic))
     shape, geometry, count = q.shape[:-1], arm.geometry, math.prod(q.shape[:-1])
-    rows, wanted = q.reshape(count, q.shape[-1]), poses.reshape(count, 4, 4)
-    # An arm that has expanded reaches a position where the arm at 20 C reaches it divided by the scale of lengths.
-    scale, xp = length_scale(geometry, rows), namespace(geometry, rows, wanted)
-    wanted = set_at(wanted, (slice(None), slice(3), 3), wanted[:, :3, 3] / scale[:, None])
+    xp, columns = namespace(geometry, q, poses), q.shape[-1]
 
     def solved(rows: Any) -> Any:
-        return _solve_to_poses(geometry, rows[:, :n].T, rows[:, n:].reshape(-1, 4, 4), allowed)
+        return _solve_to_poses(geometry, rows[:, :columns].T, rows[:, columns:].reshape(-1, 4, 4), allowed)
 
-    both = xp.concatenate([rows[:, :n], wanted.reshape(count, 16)], axis=1)
+    both = xp.concatenate([q.reshape(count, columns), poses.reshape(count, 16)], axis=1)
     solution = in_chunks(solved, both, ROWS) if xp is np else solved(both)
-    readings, distance, angle = solution[:, :-2], scale * solution[:, -2], solution[:, -1]
+    readings, distance, angle = solution[:, :n], solution[:, -2], solution[:, -1]
     reached = (distance <= ARRIVED) & ((angle <= _ALIGNED) | (n < FULL_POSE))
     return ReadingsAtPoses(readings.reshape(*shape, n), *(x.reshape(shape) for x in (distance, angle, reached)))
 
 
 def _solve_to_poses(
-    geometry: Geometry, q: Float[AnyArray, "n c"], poses: Float[AnyArray, "c 4 4"], limits: JointLimits
-) -> Float[AnyArray, "c columns"]:
+    geometry: Geometry, q: Float[AnyArray, "columns c"], poses: Float[AnyArray, "c 4 4"], limits: JointLimits
+) -> Float[AnyArray, "c others"]:
     """Readings by damped least-norm steps to the poses, and the distance (mm) and angle (rad) that remain."""
-    xp, whole = namespace(geometry, q, poses), q.shape[0] >= FULL_POSE
+    xp, n = namespace(geometry, q, poses), len(limits)
+    whole = n >= FULL_POSE
     low, high, units = limits[:, :1], limits[:, 1:], reading_units(geometry)[:, None]
 
     def step(q: Any, wanted: Any) -> tuple[Any, Any]:
@@ -343,18 +341,18 @@ def _solve_to_poses(
             gap = xp.concatenate([gap, _LEVER * rotation])
             columns = xp.concatenate([columns, _LEVER * reading_rotations(forward)], axis=1)
         columns = columns * units[:, None]
-        change = _least_norm(columns, gap)
+        change, joints = _least_norm(columns, gap), q[:n]
         # A joint at its limit that a step would take beyond stays there, and the others do what they can.
-        stays = ((q <= low) & (change < 0)) | ((q >= high) & (change > 0))
+        stays = ((joints <= low) & (change < 0)) | ((joints >= high) & (change > 0))
         if xp is not np or stays.any():
             change = _least_norm(xp.where(stays[:, None], 0.0, columns), gap)
-        new = xp.clip(q + units * xp.clip(change, -LARGEST_STEP, LARGEST_STEP), low, high)
-        is_open, moves = xp.any(xp.abs(gap) > EXACT, axis=0), xp.any(xp.abs(new - q) > _STILL * units, axis=0)
-        return new, is_open & moves
+        new = xp.clip(joints + units * xp.clip(change, -LARGEST_STEP, LARGEST_STEP), low, high)
+        is_open, moves = xp.any(xp.abs(gap) > EXACT, axis=0), xp.any(xp.abs(new - joints) > _STILL * units, axis=0)
+        return xp.concatenate([new, q[n:]]), is_open & moves
 
     # The step after the gap was seen to be closed takes what Newton's method leaves to rounding.
     wanted = xp.moveaxis(poses[:, :3], 0, -1)
-    q = repeated(step, xp.clip(q, low, high), [wanted], _STEPS)
+    q = repeated(step, xp.concatenate([xp.clip(q[:n], low, high), q[n:]]), [wanted], _STEPS)
     shift, rotation = _remaining(forward_pass(geometry, joint_motion(geometry, q.T)), wanted)
     return xp.column_stack([q.T, xp.linalg.norm(shift, axis=0), xp.linalg.norm(rotation, axis=0)])
 

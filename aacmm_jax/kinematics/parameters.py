@@ -1,5 +1,6 @@
 """Which parameters of an arm are free, within what bounds, and what the file of an arm proposes for both."""
 
+import re
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from types import MappingProxyType
@@ -34,6 +35,7 @@ from .inverse_kinematics import SocketPoses
 from .jacobian import Indices
 from .priors import Prior
 
+_MJCF = re.compile(r"(?:[^<]++|(?><!--.*?-->)|(?><\?.*?\?>))*+<mujoco\b", re.DOTALL)
 _HalfWidth = Annotated[float, Range(least=0, infinite=True)]
 
 
@@ -295,11 +297,19 @@ def perturbed_arm(space: Parameters, *, length: NotNegative, angle: NotNegative,
 
 
 class UrdfSource(NamedTuple):
-    """The URDF that an arm was read from: what is needed to write one with the calibrated arm."""
+    """The URDF or MJCF that an arm was read from: what is needed to write one with the calibrated arm."""
 
-    text: str  # the whole file
+    text: str  # the whole file, and what it includes
     base: str  # name of the link that does not move
     tip: str  # name of the link at the end of the chain
+    first: tuple[tuple[float, ...], ...] = ()  # the arm's first frame in the base link, 4 x 4, mm
+    link: tuple[float, ...] = ()  # origin of the tip link in the last frame, mm; its axes are those of that frame
+    follows: bool = False  # whether an export moves the tip link to the calibrated probe
+
+    @property
+    def format(self) -> str:
+        """``"URDF"`` or ``"MJCF"``, as the root element says."""
+        return "MJCF" if _MJCF.match(self.text) else "URDF"
 
 
 class ArmSpecification(NamedTuple):

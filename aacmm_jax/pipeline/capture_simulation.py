@@ -12,7 +12,7 @@ from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..data.capture_data import ReferenceLength
 from ..data.noise import Noise
-from ..data.observations.observation import AbstractSimulated
+from ..data.observations.simulated import AbstractSimulated
 from ..data.recording import Recording
 from ..data.simulation import simulate
 from ..kinematics.parameters import ArmSpecification, perturbed_arm

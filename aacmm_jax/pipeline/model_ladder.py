@@ -32,7 +32,6 @@ from ..data.noise import Noise
 from ..data.recording import Recording
 from ..diagnostics.equations import PRIOR, Equations, equations_of
 from ..kinematics.arm import DOWN, Arm, without_corrections
-from ..kinematics.chain import beside_joints
 from ..kinematics.corrected_arm import with_corrections, with_couplings_of
 from ..kinematics.parameters import ArmSpecification, Bounds
 from ..kinematics.priors import default_prior
@@ -130,14 +129,13 @@ class ComparedModels(NamedTuple):
 def default_models(arm: Arm, capture: Capture) -> tuple[str, ...]:
     """`DEFAULT_MODELS`; where the capture has torques, those of gravity also with torques in its place, and where it
     has temperatures, each of them also with thermal expansion."""
-    beside = beside_joints(arm.joints, capture.columns)
-    torques, temperature = (range(capture.columns)[columns] for columns in beside)
+    recorded = arm.beside.names(capture.columns)
     models: list[str] = []
     for model in DEFAULT_MODELS:
-        if torques and "gravity" in model:
+        if "torques" in recorded and "gravity" in model:
             models.append(model.replace("gravity", "torque"))
         models.append(model)
-    if not temperature:
+    if "thermometer" not in recorded:
         return tuple(models)
     warmed = ((model, "expansion" if model == "dh" else f"{model},expansion") for model in models)
     return tuple(model for pair in warmed for model in pair)

@@ -12,7 +12,8 @@ from ..core.arguments import with_options
 from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.noise import Noise
-from ..data.observations.observation import AbstractObservation, AbstractSimulated
+from ..data.observations.observation import AbstractObservation
+from ..data.observations.simulated import AbstractSimulated
 from ..kinematics.arm import Arm
 from ..kinematics.collisions import Cell
 from ..kinematics.workspace import Cone, cones_of, reached

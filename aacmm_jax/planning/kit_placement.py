@@ -17,7 +17,8 @@ from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.rotations import rotation_vector
 from ..data.capture import Capture
-from ..data.observations.observation import AbstractObservation, AbstractSimulated
+from ..data.observations.observation import AbstractObservation
+from ..data.observations.simulated import AbstractSimulated
 from ..kinematics.workspace import TOOL_AXIS, Cone, SearchRegion, cones_of, lowest_point, reached, total_link_length
 from ..model.observed import Observed
 from ..uncertainty.linearisation import Linearisation

@@ -27,6 +27,7 @@ _LONGEST_HEAD = 0.012  # of an image's width
 _SAME = 0.01  # px: a direction that the model does not lead back to its pixel has none
 _VIEW = 0.3  # of the distance to the target: the length of the lines of sight
 _FLAT = 1e-6  # mm
+_PICTURES = 6  # of images
 _FAR = 5.0  # medians of the residuals: farther ones are drawn in another tone
 
 
@@ -44,6 +45,8 @@ class Image(NamedTuple):
     ids: Int[np.ndarray, " c"]
     owner: Int[np.ndarray, " c"]  # of which image each corner is
     names: list[str]  # of the images
+    pictures: list[str]  # of these: JPEG, in base64; empty where there is none
+    refused: list[tuple[str, str]]  # pictures of images that are not used, and names with reasons
 
     @property
     def size(self) -> Float[np.ndarray, " 2"]:
@@ -55,10 +58,20 @@ def images_of(record: CalibrationRecord) -> list[Image]:
     """What each camera of a calibration saw; without cameras nothing."""
     arm, geometry = record.calibrated.arm, record.observed.geometry
     observations = [each for each in record.recording.capture.observations if isinstance(each, Pixels)]
+    kept = {(read.observation, read.image): read for read in record.recording.images if read.preview}
     images = []
     for number, name in enumerate(dict.fromkeys(each.camera for each in observations), start=1):
         own = [each for each in observations if each.camera == name]
-        images.append(_image(own, [reprojection(arm, each, geometry) for each in own], number))
+        seen = [reprojection(arm, each, geometry) for each in own]
+        keys = [(each.name, image) for each in own for image in each.images or [""] * len(each.q)]
+        pictures = [str(kept[key].preview) if key in kept else "" for key in keys]
+        names = {each.name for each in own}
+        refused = [
+            (str(read.preview), f"{read.image}: {read.refused}")
+            for read in kept.values()
+            if read.refused and read.observation in names
+        ]
+        images.append(_image(own, seen, number)._replace(pictures=pictures, refused=refused))
     return images
 
 
@@ -81,16 +94,20 @@ def _image(observations: list[Pixels], seen: list[Reprojection], number: int = 1
     return Image(
         number=number, camera=first.camera, model=first.camera_model, intrinsics=intrinsics, low=low, high=high,
         corners=corners, residuals=residuals, ids=np.concatenate(ids), owner=np.concatenate(owner), names=names,
+        pictures=[""] * len(names), refused=[],
     )  # fmt: skip
 
 
-def _plot(image: Image, marks: tuple[Marks, ...], title: str = "") -> Plot:
-    """Marks on the image plane: x to the right, y downwards, and the edges of the image."""
+def _plot(image: Image, marks: tuple[Marks, ...], title: str = "", margin: float = 0.0) -> Plot:
+    """Marks on the image plane: x to the right, y downwards, and the edges of the image with a margin, px."""
     (left, top), (right, bottom) = image.low, image.high
     border = Marks("", [left, right, right, left, left], [top, top, bottom, bottom, top], "line", "soft", size=4)
     axes = [
         Axis(f"{name} [{image.model.unit}]", *ends, round_ticks(min(ends), max(ends)))
-        for name, ends in (("x", (float(left), float(right))), ("y", (float(bottom), float(top))))
+        for name, ends in (
+            ("x", (float(left) - margin, float(right) + margin)),
+            ("y", (float(bottom) + margin, float(top) - margin)),
+        )
     ]
     return Plot(axes[0], axes[1], (border, *marks), title=title, image=True)
 
@@ -170,6 +187,40 @@ def _by_image(image: Image, sizes: Float[np.ndarray, " c"]) -> Table:
     return by_columns(f"Residuals by image of {image.camera}", columns)
 
 
+def picture_charts(image: Image) -> list[Chart]:
+    """Some of the images with the residuals of their corners, from the largest ones to the smallest, and images that
+    are not used; nothing where no pictures were kept."""
+    sizes, count, charts = np.linalg.norm(image.residuals, axis=1), len(image.names), list[Chart]()
+    rms = np.sqrt(np.bincount(image.owner, sizes**2, count) / np.bincount(image.owner, minlength=count))
+    factor, starts = _magnification(sizes, _LONG * float(image.size[0])), image.corners - image.residuals
+    kept = [i for i in np.argsort(-rms).tolist() if image.pictures[i]]
+    plots = []
+    for i in (kept[place] for place in thinned(len(kept), _PICTURES)):
+        own = image.owner == i
+        arrows = _arrows(image, "", starts[own], factor * image.residuals[own], "bright")
+        (x, y), words = starts[own].T, [f"corner {number}" for number in image.ids[own]]
+        marks = Marks("", x, y, "dot", "bright", words, size=4), arrows
+        plots.append(_picture(image, image.pictures[i], f"{image.names[i]}: {rms[i]:.3g} px RMS", marks))
+    description = (
+        f"{len(plots)} of {count} images, from the largest residuals to the smallest. Arrows lead from where the "
+        f"calibration has each corner towards where it was seen, {factor:g} times as long."
+    )
+    if plots:
+        charts.append(Chart(f"pictures-{image.number}", f"Images of {image.camera}", description, tuple(plots)))
+    if image.refused:
+        refused = [_picture(image, *item) for item in image.refused[:_PICTURES]]
+        title = f"Images of {image.camera} that are not used"
+        description = f"{len(refused)} of {pluralise(len(image.refused), 'image')}, with the reason."
+        charts.append(Chart(f"refused-{image.number}", title, description, tuple(refused)))
+    return charts
+
+
+def _picture(image: Image, picture: str, title: str, marks: tuple[Marks, ...] = ()) -> Plot:
+    """Marks on a picture, without numbers at its edges."""
+    (left, top), (right, bottom) = image.low.tolist(), image.high.tolist()
+    return Plot(Axis("", left, right), Axis("", bottom, top), marks, title, image=True, picture=picture)
+
+
 def distortion_chart(image: Image) -> Chart | None:
     """How far the lens displaces what an ideal one would show there; None of a camera without distortion."""
     if image.model.unit != "px" or not np.any(image.intrinsics[4:]):
@@ -201,7 +252,7 @@ def distortion_chart(image: Image) -> Chart | None:
     unknown = int(np.sum(~known))
     description += f" In {pluralise(unknown, 'cell')} the distortion folds back." if unknown else ""
     title = f"Distortion of {image.camera}"
-    plot = _plot(image, marks, f"arrows: {factor:g} times the displacement")
+    plot = _plot(image, marks, f"arrows: {factor:g} times the displacement", cell)  # arrows at the edges lead outwards
     return Chart(f"distortion-{image.number}", title, description, (plot,))
 
 
@@ -282,10 +333,7 @@ def camera_coverage(record: CalibrationRecord, camera: str | None = None, axes: 
 def camera_residuals(record: CalibrationRecord, camera: str | None = None, axes: Any = None) -> Any:
     """Plot the residuals of all corners as arrows on the image plane of a camera; the title has the magnification.
 
-    Args:
-        record: The calibration.
-        camera: Name of the camera; the first one if None. `InputError` if the calibration has none of this name.
-        axes: Axes to plot into, which are returned; new ones if None.
+    The arguments are those of `camera_coverage`.
 
     Example:
         >>> aj.plot.camera_residuals(seen).figure.savefig("figure.svg")
@@ -297,11 +345,7 @@ def camera_distortion(record: CalibrationRecord, camera: str | None = None, axes
     """Plot how far the lens of a camera displaces what it would show without distortion; the title has the
     magnification of the arrows.
 
-    Args:
-        record: The calibration.
-        camera: Name of the camera; the first one if None. `InputError` if the calibration has none of this name, or if
-            it has no distortion.
-        axes: Axes to plot into, which are returned; new ones if None.
+    The arguments are those of `camera_coverage`. `InputError` if the camera has no distortion.
 
     Example:
         >>> aj.plot.camera_distortion(seen).figure.savefig("figure.svg")
@@ -333,7 +377,8 @@ def camera_poses(record: CalibrationRecord, axes: Any = None) -> Any:
         for i, line in reversed(list(enumerate(moving))):
             axes.plot(*line.T, color=TONES["soft"] if i else TONES["main"], linewidth=1.5 if not i else 0.6)
         axes.plot(*still.T, color=TONES["accent"], linewidth=2)
-    axes.set_aspect("equal")
+    ranges = [np.ptp(ends) for ends in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
+    axes.set_box_aspect(ranges, zoom=0.85)  # as equal axes, with room for their labels
     return axes
 
 

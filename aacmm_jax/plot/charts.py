@@ -38,7 +38,7 @@ class Marks(NamedTuple):
     # thick vertical bars); boxes from the axis up to y, or about y; level and border: thin lines across at each y or x;
     # text: its words, centred.
     symbol: str = "dot"
-    tone: str = "main"  # "main", "accent", "soft", "ink", "page"; in figures any colour
+    tone: str = "main"  # "main", "accent", "soft", "ink", "page"; "bright" on pictures; in figures any colour
     words: Sequence[str] = ()  # said of each mark under the pointer, or written
     low: Numbers | None = None  # ends of bars, or of a band
     high: Numbers | None = None
@@ -94,6 +94,7 @@ class Plot(NamedTuple):
     height: int = 300  # pixels, of the axes
     square: bool = False  # both axes equally long
     image: bool = False  # an image plane: as wide and high as its numbers, on a page too
+    picture: str = ""  # behind the marks, on a page only: JPEG, in base64
 
 
 class Chart(NamedTuple):

@@ -13,7 +13,7 @@ from ..core.errors import InputError, require
 from ..files.outputs import write_atomically
 from .charts import Axis, Marks, Plot
 
-TONES = {"main": "#1b3a6b", "accent": "#d95f02", "soft": "0.65", "ink": "0.2", "page": "white"}
+TONES = {"main": "#1b3a6b", "accent": "#d95f02", "soft": "0.65", "ink": "0.2", "page": "white", "bright": "#ff6a13"}
 _SHADES = ("#dbe3ef", "#b3c2da", "#8aa0c3", "#6079a5", "#3a5586", "#14305f")
 _MARKERS = {"dot": "o", "square": "s", "triangle": "^", "diamond": "D", "cross": "x", "ring": "o"}
 _LINES = {"line": "-", "dashed": "--", "dotted": ":"}

@@ -14,6 +14,7 @@ from .charts import Marks, Plot
 
 _CHARACTER = 6.6  # pixels: mean width of one in a label
 _OVERLAP = 16  # pixels: least distance of labels of the vertical axis
+_WHOLE = 'preserveAspectRatio="none" width="100%" height="100%"'
 _LINES = ("line", "dashed", "dotted")
 
 
@@ -34,7 +35,10 @@ def drawn(plot: Plot, label: str) -> str:
     kind = " square" if plot.square else " image" if plot.image else ""
     # Lines across are below everything else.
     ordered = sorted(plot.marks, key=lambda marks: marks.symbol not in ("level", "border"))
-    body = "".join((*_grid(plot), *(part for marks in ordered for part in _marks(plot, marks)), *_labels(plot)))
+    picture = f'<image href="data:image/jpeg;base64,{html.escape(plot.picture)}" {_WHOLE}/>' if plot.picture else ""
+    body = "".join(
+        (picture, *_grid(plot), *(part for marks in ordered for part in _marks(plot, marks)), *_labels(plot))
+    )
     return (
         f'<div class="plot">{title}{y_title}<div class="axes{kind}" style="{style}">'
         f'<svg role="img" aria-labelledby="{label}" style="{size}">{body}</svg></div>'
@@ -75,7 +79,7 @@ def _path(d: Iterable[str], kind: str, width: float | None = None) -> str:
     """A path in thousandths of the axes, whose lines keep their width."""
     stroke = "" if width is None else f' stroke-width="{width:g}"'
     return (
-        '<svg viewBox="0 0 1000 1000" preserveAspectRatio="none" width="100%" height="100%">'
+        f'<svg viewBox="0 0 1000 1000" {_WHOLE}>'
         f'<path class="{kind}" vector-effect="non-scaling-stroke"{stroke} d="{"".join(d)}"/></svg>'
     )
 

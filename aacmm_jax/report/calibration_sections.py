@@ -12,7 +12,7 @@ from ..diagnostics.joint_travel import tried_poses
 from ..diagnostics.pose_residuals import observation_residuals
 from ..kinematics.arm import joint_limits, parameter_unit
 from ..model.sockets import pose_outliers
-from ..plot.cameras import coverage_chart, distortion_chart, images_of, residual_chart
+from ..plot.cameras import coverage_chart, distortion_chart, images_of, picture_charts, residual_chart
 from ..plot.charts import Chart, Marks, Plot, linear, names, thinned
 from ..plot.lengths import tried_chart, volume_chart
 from ..plot.parameters import bounds_chart, change_chart, correlation_chart, functions_chart, singular_chart
@@ -124,7 +124,7 @@ def cameras(record: CalibrationRecord, summary: dict[str, Any]) -> list[Section]
     distortion."""
     blocks: list[Block] = [*images_words(image_rows(record.recording)), *camera_view(summary)]
     for image in images_of(record):
-        charts = coverage_chart(image), residual_chart(image, DRAWN), distortion_chart(image)
+        charts = coverage_chart(image), residual_chart(image, DRAWN), *picture_charts(image), distortion_chart(image)
         blocks += filter(None, charts)
     return [Section("cameras", "Cameras", blocks)] if blocks else []
 

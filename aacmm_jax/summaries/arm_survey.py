@@ -105,7 +105,7 @@ def _left_out(arm: Arm, model: str | None) -> list[str]:
         return []
     limits = joint_limits(arm, None)
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (50, arm.joints))
-    values = function_values(arm.corrections.nominal, gone, q, np.asarray(arm.gravity))
+    values = function_values(arm, gone, q)
     why: dict[tuple[int, str], list[str]] = {}
     for term, row in zip(gone, values, strict=True):
         reason = _OTHERS if np.abs(row).max() > 1e-9 else _NO_MOMENT

@@ -25,7 +25,6 @@ from ..diagnostics.pose_residuals import rms
 from ..diagnostics.recorded import findings_of_capture
 from ..diagnostics.usability import on_bounds
 from ..kinematics.arm import Arm, by_joint, correction_names, parameter_unit, value_of
-from ..kinematics.chain import beside_joints
 from ..kinematics.corrected_arm import loads_of
 from ..kinematics.corrections import coefficient_of
 from ..kinematics.parameters import ArmSpecification
@@ -73,7 +72,7 @@ def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
             for name, coefficient in kinds.items()
         ],
         "held": list(specification.space().held),
-        "urdf": None if urdf is None else {"base": urdf.base, "tip": urdf.tip},
+        "urdf": None if urdf is None else {"format": urdf.format, "base": urdf.base, "tip": urdf.tip},
     }
 
 
@@ -88,9 +87,9 @@ def parameters_csv(record: CalibrationRecord) -> str:
 
 def capture_summary(recording: Recording) -> dict[str, Any]:
     """A capture: sockets with their poses, lengths, the nominal arm."""
-    capture, units = recording.capture, by_joint(recording.nominal.arm, "rad", "mm")
-    q = np.asarray(capture.readings)
-    torques, warmth = (q[:, columns] for columns in beside_joints(len(units), q.shape[1]))
+    capture, arm = recording.capture, recording.nominal.arm
+    q, units, beside = np.asarray(capture.readings), by_joint(arm, "rad", "mm"), arm.beside.slices(capture.columns)
+    torques, load, warmth = (q[:, beside[name]] for name in ("torques", "load", "thermometer"))
     ends = zip(units, q.min(axis=0).tolist(), q.max(axis=0).tolist(), strict=False)
     return {
         "kind": "capture",
@@ -100,12 +99,14 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
         "sockets": rows_of(socket=capture.names, poses=capture.sizes),
         "observations": capture_observations(capture),
         "images": image_rows(recording),
+        "notes": list(recording.notes),
         "lengths": reference_length_rows(capture.lengths, u_mm=[float(length.u) for length in capture.lengths]),
         "ranges": [
             {"joint": i, f"lowest_{unit}": low, f"highest_{unit}": high}
             for i, (unit, low, high) in enumerate(ends, start=1)
         ],
         "largest_torques_Nm": np.abs(torques).max(axis=0).tolist() if torques.size else None,
+        "load_kg": [float(load.min()), float(load.max())] if load.size else None,
         "temperature_C": [float(warmth.min()), float(warmth.max())] if warmth.size else None,
         "simulated": recording.true is not None,
         "warnings": sentences(findings_of_capture(recording)),

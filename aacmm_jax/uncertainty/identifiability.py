@@ -325,10 +325,7 @@ class _Spectrum(NamedTuple):
         shows."""
         random = np.random.default_rng(0)
         q = random.uniform(-np.pi, np.pi, (_CONFIGURATIONS, self.arm.joints))
-        if self.arm.torques:
-            q = np.concatenate([q, random.uniform(-100.0, 100.0, (_CONFIGURATIONS, self.arm.joints))], axis=1)
-        if self.arm.thermometer:
-            q = np.concatenate([q, random.uniform(10.0, 30.0, (_CONFIGURATIONS, 1))], axis=1)
+        q = np.hstack([q, self.arm.beside.drawn(_CONFIGURATIONS, random)])
         rows = 3 * _CONFIGURATIONS
         movements = (jacobian_at(self.arm, q, self.names) * np.asarray(self.space.scale) @ null).reshape(rows, -1)
         rigid = rigid_motions(np.asarray(self.arm.position(q))).reshape(rows, 6)
@@ -351,7 +348,7 @@ class _Spectrum(NamedTuple):
     def with_more(
         self, sockets: dict[str, Float[np.ndarray, "_ _"]], lengths: Sequence[ReferenceLength] = ()
     ) -> "_Spectrum":
-        """With invented sockets, which have the first pose's torques and temperature where they have none."""
+        """With invented sockets, which have what was recorded beside the first pose's readings where they lack it."""
         capture, joints = self.capture, self.arm.joints
         beside, more = np.asarray(capture.readings)[:1, joints:], dict(capture.sockets)
         for name, q in sockets.items():
@@ -388,7 +385,7 @@ class _Spectrum(NamedTuple):
                 starts[:, : arm.joints] += random.uniform(-1.5, 1.5, (60, arm.joints))
                 moved, reached = project_to_targets(arm, starts, np.asarray(arm.position(first)))
                 more_poses[f"\0 {name}"] = moved[reached] if reached.any() else first[:1]
-            if capture.columns in (arm.joints + 1, 2 * arm.joints + 1):
+            if "thermometer" in arm.beside.names(capture.columns):
                 shift = 10.0 * (np.arange(capture.columns) == capture.columns - 1)  # K
                 warmer[f"\0 {name}"] = np.concatenate([q, q + shift])
         length = "a second position of the reference length" if capture.lengths else "a reference length"

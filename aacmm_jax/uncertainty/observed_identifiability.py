@@ -258,9 +258,7 @@ def _cause(arm: Arm, q: Float[np.ndarray, "N n"], term: Term, names: tuple[str, 
     """A key of `_SENTENCES`; empty where the function is none of these."""
     assert arm.corrections is not None
     elsewhere = q + np.random.default_rng(0).uniform(-np.pi, np.pi, q.shape)
-    everywhere, here = (
-        function_values(arm.corrections.nominal, [term], poses, np.asarray(arm.gravity))[0] for poses in (elsewhere, q)
-    )
+    everywhere, here = (function_values(arm, [term], poses)[0] for poses in (elsewhere, q))
     size = np.abs(everywhere).max()
     if size < _ZERO or np.abs(here).max() < _ZERO * size:
         return "zero"

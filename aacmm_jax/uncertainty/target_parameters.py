@@ -7,7 +7,6 @@ from ..data.capture import Capture
 from ..data.observations.measured import MeasuredTransforms
 from ..data.observations.observation import offset_of
 from ..kinematics.arm import Arm, correction_names, parameter_names
-from ..kinematics.chain import beside_joints
 from ..kinematics.correction_kinds import Expansion
 from ..kinematics.parameters import Parameters
 from ..model.observed import Observed
@@ -33,7 +32,7 @@ def determined_parameters(arm: Arm, capture: Capture | None = None) -> Parameter
         return Parameters.independent(arm)
     space = independent_of_targets(arm, capture) if only_targets(capture) else Parameters.independent(arm)
     coefficient = Expansion.words[0]
-    temperature = np.asarray(capture.readings)[:, beside_joints(arm.joints, capture.columns)[1]]
+    temperature = np.asarray(capture.readings)[:, arm.beside.slices(capture.columns)["thermometer"]]
     varies = temperature.size > 0 and float(np.ptp(temperature)) >= _VARIES
     if coefficient not in correction_names(arm) or not varies:
         return space

@@ -183,8 +183,8 @@ def _each(matrices: Float[AnyArray, "m r s"], vectors: Float[AnyArray, "s m"]) -
     return products(namespace(matrices).moveaxis(matrices, 0, -1), vectors[None])[:, 0]
 
 
-def without_rest(rows: list[Rows]) -> list[Rows]:
-    """Rows in which those are 0 that errors of the arm do not reach (`data.observations.reduced_rows`)."""
+def only_moved_rows(rows: list[Rows]) -> list[Rows]:
+    """Rows of which those are 0 that errors of the arm do not reach (`data.observations.reduced_rows`)."""
     xp = namespace([part.values for part in rows])
     kept = [part.values if part.basis is None else xp.where(_not_moved(part.values), 0.0, part.values) for part in rows]
     return [part._replace(values=values) for part, values in zip(rows, kept, strict=True)]
@@ -202,7 +202,7 @@ def scatter_of(
     The sum of w.w over all rows equals its degrees of freedom (Paule and Mandel 1982); 0 where what was measured
     explains more than all. Its derivative is that of the implicit equation.
     """
-    xp, rows = namespace([part.values for part in rows], errors, degrees_of_freedom), without_rest(rows)
+    xp, rows = namespace([part.values for part in rows], errors, degrees_of_freedom), only_moved_rows(rows)
 
     def excess(log_sigma: Any, rows: list[Rows], errors: list[ArmErrors], expected: Any) -> tuple[Any, Any]:
         """Of the weighted sum over its expectation, and its derivative by the logarithm of sigma."""
@@ -246,7 +246,7 @@ def robust_scatter_of(
 ) -> Float[AnyArray, ""]:
     """The same from the median of the poses' squared residuals, each over its median for normal errors: a few bad poses
     do not change it much."""
-    xp, rows = namespace([part.values for part in rows], errors), without_rest(rows)
+    xp, rows = namespace([part.values for part in rows], errors), only_moved_rows(rows)
     constant, expected = stop_gradient((rows, errors)), stop_gradient(degrees_of_freedom)
     lengths = [len(part.values) if part.basis is None else MOVED for part in rows]
     count = sum(length * part.values.shape[1] for length, part in zip(lengths, rows, strict=True))

@@ -14,7 +14,8 @@ from importlib import metadata
 from pathlib import Path
 
 import aacmm_jax as aj
-from aacmm_jax.files.urdf_text import collision_shapes, parse_urdf
+from aacmm_jax.files.mjcf_text import parse_robot
+from aacmm_jax.files.urdf_text import collision_shapes
 
 from . import texts
 from .outcomes import Attempt, exact, read_again
@@ -147,9 +148,9 @@ def urdf_files() -> list[Path]:
 def urdf_content(path: Path) -> tuple:
     """All that arms, their masses and their bodies take from a URDF."""
     text = path.read_text(encoding="utf-8")
-    robot = parse_urdf(text)
+    robot = parse_robot(text)
     joints = {name: joint._replace(element=None) for name, joint in robot.joints.items()}
-    return joints, robot.links, collision_shapes(text)
+    return joints, robot.links, collision_shapes(robot)
 
 
 def _tomls(folder: Path) -> dict[str, Callable[[], object]]:

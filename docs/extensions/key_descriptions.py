@@ -4,6 +4,10 @@ POINT = "Position in the base frame, mm."
 DESCRIPTIONS = {
     # Manifests
     "file": "Path of the file, relative to this file; for sockets and observations, it may have fields in braces.",
+    "table": "What is read in a file that is not a text table: variables, a sheet, topics, a feature.",
+    "readings_table": "The same as `table`, for the file of `readings`.",
+    "PixelsTable.corner_table": "The same as `table`, for the file of `corners`.",
+    "Angles.calibration": "LeRobot's calibration file, with which its counts, degrees or percent become angles.",
     "files": "Several files, instead of `file`; for an artefact also `{ point = file }`.",
     "exclude": "Shell patterns of files to leave out.",
     "session": "Session in which the data were recorded; the probe was remounted between sessions.",
@@ -86,6 +90,10 @@ DESCRIPTIONS = {
     "limits": "Lowest and highest reading.",
     "torques": "In an arm file, whether readings have the torque of each joint beside them; in a manifest, the columns "
     "of these torques, N m.",
+    "directions": "In an arm file, whether readings have the direction of approach of each joint beside them; in a "
+    "manifest, the columns of these directions: 1 after a rising reading, -1 after a falling one, 0 unknown.",
+    "load": "Whether readings have the mass at the tip beside them.",
+    "load_kg": "Mass at the tip, kg, besides that of the arm and its tool.",
     "thermometer": "Whether readings have the arm's temperature as a last column.",
     "identification": "Free and fixed parameters, and the bounds of the free parameters.",
     "held": "Names of the fixed parameters.",
@@ -207,6 +215,7 @@ DESCRIPTIONS = {
     "KitPixels.distance": "Least and largest distance of the target from the camera, mm, at which images are sharp.",
     "KitPixels.tilt_deg": "Largest angle between the target's normal and the line of sight, deg.",
     "KitPixels.u": "Standard deviation of a coordinate of a corner, px.",
+    "KitPixels.poses": "Number of poses that are simulated. A plan chooses its own number.",
     "_Kit.points": "An instrument that measures points.",
     "Distribution.normal": "Standard deviation of a normal distribution.",
     "_Box.rotation": "Rotation vector, rad.",

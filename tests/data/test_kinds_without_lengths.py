@@ -21,7 +21,8 @@ from aacmm_jax.core.rotations import cross, cross_matrix, rotation_and_derivativ
 from aacmm_jax.data.observations.declared import Part, declared
 from aacmm_jax.data.observations.geometry import seen_from, variances
 from aacmm_jax.data.observations.measured import AbstractInBox
-from aacmm_jax.data.observations.observation import FRAME, OTHER_KINDS, AbstractObservation, Rows
+from aacmm_jax.data.observations.observation import FRAME, AbstractObservation, Rows
+from aacmm_jax.data.observations.simulated import OTHER_KINDS
 from aacmm_jax.files import manifest, manifest_tables
 from tests.conftest import command_line
 

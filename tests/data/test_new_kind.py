@@ -10,7 +10,8 @@ from aacmm_jax.core.numpy_or_jax import AnyArray, namespace, to_numpy
 from aacmm_jax.core.rotations import cross, rotation_and_derivative, rotation_matrix
 from aacmm_jax.data.observations.declared import Part, declared
 from aacmm_jax.data.observations.geometry import turned_z, variances
-from aacmm_jax.data.observations.observation import OTHER_KINDS, AbstractObservation, AbstractSimulated, Rows, kinds
+from aacmm_jax.data.observations.observation import AbstractObservation, Rows
+from aacmm_jax.data.observations.simulated import OTHER_KINDS, AbstractSimulated, kinds
 from aacmm_jax.summaries.observations import capture_observations
 
 from .test_observations import TIPS, Q, check_derivatives, columns

@@ -16,12 +16,12 @@ from aacmm_jax.data.observations.geometry import distances_from_axis, fitted_cyl
 from aacmm_jax.data.observations.held import platform_frames
 from aacmm_jax.data.observations.observation import (
     AbstractObservation,
-    AbstractSimulated,
     Tips,
     certified_quantities,
     stated_quantities,
 )
-from aacmm_jax.data.observations.observation import kinds as known_kinds
+from aacmm_jax.data.observations.simulated import AbstractSimulated
+from aacmm_jax.data.observations.simulated import kinds as known_kinds
 
 RANDOM = np.random.default_rng(1)
 POSES = 12

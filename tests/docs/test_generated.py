@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from aacmm_jax.data.observations.observation import kinds
+from aacmm_jax.data.observations.simulated import kinds
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "docs" / "extensions"))
 import command_pages

@@ -11,8 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
+from aacmm_jax.files.mjcf_text import parse_robot
 from aacmm_jax.files.urdf import urdf_chain, urdf_of
-from aacmm_jax.files.urdf_text import parse_urdf
 from aacmm_jax.kinematics.arm import by_joint
 from aacmm_jax.kinematics.parameters import ArmSpecification, UrdfSource
 
@@ -123,7 +123,7 @@ def test_every_chain_in_and_out(tmp_path, every):
     print("\nlargest differences, mm and rad, with yourdfpy and Pinocchio; after a calibration; its errors in mm")
     for path in robots()[::every]:
         text = path.read_text(encoding="utf-8")
-        robot = parse_urdf(text)
+        robot = parse_robot(text)
         model = yourdfpy.URDF.load(str(path), load_meshes=False, build_scene_graph=True)
         other = pinocchio.buildModelFromXML(text)
         parents = {joint.parent for joint in robot.joints.values()}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.data.observations.observation import simulated_kinds
+from aacmm_jax.data.observations.simulated import simulated_kinds
 from aacmm_jax.files.kits import target_tables
 
 from ..refusals import assert_refused

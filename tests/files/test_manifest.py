@@ -83,7 +83,7 @@ def test_torques(tmp_path, motion):
     recording = aj.files.read_manifest(tmp_path / "capture.toml")
     expected = np.column_stack([motion, loads, table[:, 3]])
     np.testing.assert_array_equal(recording.capture.sockets["a"], expected)
-    assert (recording.nominal.arm.torques, recording.nominal.arm.thermometer) == (True, True)
+    assert recording.nominal.arm.recorded == ("torques", "thermometer")
     record(tmp_path / "b.csv", np.column_stack([motion, loads]), header="q1,q2,q3,q4,q5,q6,l1,l2,l3,l4,l5,l6\n")
     chosen = read(tmp_path, HEAD + ANGLES + 'torques = "l*"\n' + socket.replace("a.csv", "b.csv"))
     np.testing.assert_array_equal(chosen.sockets["b"], expected[:, :12])
@@ -271,7 +271,7 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         (SMALL.replace("a.csv", "folder"), ["folder is a folder", "give a file"]),
         (
             SMALL.replace("rad", "grad"),
-            ["'angles.unit' must be 'rad', 'deg', 'arcsec', 'gon', 'mrad' or 'counts', not 'grad'"],
+            ["'angles.unit' must be 'rad', 'deg', 'arcsec', 'gon', 'mrad', 'counts' or 'percent', not 'grad'"],
         ),
         (HEAD + SOCKET, ["'angles' is missing", "unit of the readings", "add [angles]"]),
         (HEAD + ANGLES, ["no [[socket]] and no other observation", "add at least one"]),

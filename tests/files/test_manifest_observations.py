@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
-from aacmm_jax.data.observations.observation import kinds as known_kinds
 from aacmm_jax.data.observations.pixels import Pixels
+from aacmm_jax.data.observations.simulated import kinds as known_kinds
 from aacmm_jax.files.manifest_tables import TABLES
 from tests.refusals import assert_refused
 

@@ -1,5 +1,6 @@
 """[[pixels]] in manifests: tables of corners and nested lists, which image belongs to which pose, and bad input."""
 
+import base64
 import json
 import shutil
 from pathlib import Path
@@ -8,11 +9,15 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.camera import detection
+from aacmm_jax.data.cameras.camera import camera_models
 from tests.refusals import assert_refused
 
 TARGET = '[[target]]\nname = "board"\nkind = "charuco"\nsquares = [6, 5]\nsize = 30.0\nmarker = 22.0\n'
 CAMERA = '[[camera]]\nname = "webcam"\nimage_size = [640, 480]\n'
 PIXELS = '[[pixels]]\ncamera = "webcam"\ntarget = "board"\nfile = "joints.csv"\ncorners = "corners.csv"\n'
+HUGE = b"\xff\xd8\xff\xc0\x00\x0b\x08\xff\xff\xff\xff\x01\x01\x11\x00"  # 65535 x 65535 px
+JPEG_OF_HUGE_SIZE = base64.b64encode(HUGE).decode()
 JOINTS = [f"q_{i}_deg" for i in range(1, 7)]
 
 
@@ -184,6 +189,51 @@ def test_tables_that_make_no_sense_are_refused(tmp_path, seen, table, old, new, 
     assert_refused(lambda: read(tmp_path), *parts)
 
 
+def line(image, i, u, v):
+    return f"{image},{i},{u},{v}"
+
+
+KNOWN = TARGET + CAMERA + 'intrinsics = { fx = 600, fy = 610, cx = 319.5, cy = 239.5 }\nu = "exact"\n' + PIXELS
+LARGER = KNOWN.replace("319.5", "959.5").replace("239.5", "539.5").replace("[640, 480]", "[1920, 1080]")
+FEW, ON_A_LINE, BEHIND = "only 3 corners", "its 5 corners are on one line", "the board is seen from behind"
+
+
+@pytest.mark.parametrize(
+    ("change", "text", "parts"),
+    [
+        (lambda *row: line(*row) if row[1] < 3 else "", KNOWN, [FEW, "'img_0.png' and 11 more"]),
+        (lambda *row: line(*row) if row[1] < 5 else "", KNOWN, [ON_A_LINE, "'img_0.png' and 11 more"]),
+        (lambda image, i, u, v: line(image, i, 639 - u, v), KNOWN, [BEHIND, "'img_0.png' and 11 more"]),
+        (line, LARGER.replace("600", "1800").replace("610", "1830"), ["others (fx = 60", "another image size"]),
+    ],
+    ids=["few corners", "on one line", "mirrored", "intrinsics of another image size"],
+)
+def test_corners_that_show_no_view_are_refused(tmp_path, seen, change, text, parts):
+    files(tmp_path, seen)
+    head, *rows = (tmp_path / "corners.csv").read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    changed = [change(image, int(i), float(u), float(v)) for image, i, u, v in cells]
+    (tmp_path / "corners.csv").write_text("\n".join([head, *filter(None, changed)]) + "\n")
+    assert_refused(lambda: read(tmp_path, text), *parts)
+
+
+def test_images_of_another_size_than_the_intrinsics_are_refused(tmp_path):
+    pytest.importorskip("cv2")
+    part_of_example(tmp_path, 2)
+    text = (tmp_path / "webcam.toml").read_text()
+    (tmp_path / "webcam.toml").write_text(text.replace("[640, 480]", "[1280, 720]"))
+    said = "it has 640 x 480 px, but the intrinsics of the camera are for 1280 x 720 px"
+    assert_refused(lambda: aj.files.read_manifest(tmp_path / "webcam.toml"), said, "'webcam/01.jpg' and 1 more")
+
+
+@pytest.mark.parametrize("model", ["pinhole", "fisheye"])
+def test_points_behind_a_camera_are_not_seen(model):
+    """In space, where no image shows them; at the edge, the distortion folds."""
+    camera, lens = camera_models()[model], np.array([600.0, 610, 320, 240, -0.3, 0, 0, 0])
+    points = np.array([[0.0, 0, 500], [10, 20, -500], [2000, 0, 400 if model == "pinhole" else -1]]).T
+    assert camera.folded(points, lens).tolist() == [False, True, True]
+
+
 def test_two_images_of_one_pose_are_refused(tmp_path, seen):
     files(tmp_path, seen, order=[0, *range(1, 12)])
     lines = (tmp_path / "joints.csv").read_text().splitlines()
@@ -203,16 +253,41 @@ def test_as_many_poses_as_images(tmp_path, seen):
     assert_refused(lambda: read(tmp_path), "11 images and 12 poses")
 
 
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "webcam"
+
+
+def part_of_example(folder, count):
+    """The first images of the rendered example, with their readings, which are returned, and its manifest."""
+    (folder / "webcam").mkdir()
+    for image in sorted((EXAMPLE / "webcam").iterdir())[:count]:
+        shutil.copy(image, folder / "webcam")
+    rows = (EXAMPLE / "webcam.csv").read_text().splitlines()[: count + 1]
+    (folder / "webcam.csv").write_text("\n".join(rows) + "\n")
+    shutil.copy(EXAMPLE / "webcam.toml", folder)
+    return rows
+
+
+def test_corners_are_detected_once_where_readings_are_commanded_and_measured(tmp_path, monkeypatch):
+    """The manifest is read again with the other readings."""
+    pytest.importorskip("cv2")
+    head, *rows = part_of_example(tmp_path, 4)
+    names = head.split(",")[1:]
+    both = [",".join(name.replace("_deg", f"_{role}_deg") for name in names) for role in ("cmd", "meas")]
+    twice = [f"{row},{','.join(str(float(number) + 0.1) for number in row.split(',')[1:])}" for row in rows]
+    (tmp_path / "webcam.csv").write_text("\n".join([f"image,{both[0]},{both[1]}", *twice]) + "\n")
+    text = (tmp_path / "webcam.toml").read_text() + 'columns = { q = ["q_*_meas_deg"] }\n'
+    (tmp_path / "webcam.toml").write_text(text)
+    detected, detect = [], detection.detect
+    monkeypatch.setattr(detection, "detect", lambda *given, **named: detected.append(1) or detect(*given, **named))
+    recording = aj.files.read_manifest(tmp_path / "webcam.toml")
+    assert recording.other_readings.role == "commanded"
+    assert len(recording.other_readings.capture.observations[0].q) == len(detected) == 4
+
+
 def test_images_are_read_and_drawn(tmp_path):
     cv2 = pytest.importorskip("cv2")
-    example = Path(__file__).resolve().parents[2] / "examples" / "webcam"
-    (tmp_path / "images").mkdir()
-    for image in sorted((example / "images").iterdir())[:5]:
-        shutil.copy(image, tmp_path / "images")
-    cv2.imwrite(str(tmp_path / "images" / image.name), np.full((480, 640), 128, dtype=np.uint8))  # nothing in it
-    rows = (example / "joints.csv").read_text().splitlines()[:6]
-    (tmp_path / "joints.csv").write_text("\n".join(rows) + "\n")
-    shutil.copy(example / "webcam.toml", tmp_path)
+    rows = part_of_example(tmp_path, 5)
+    cv2.imwrite(str(tmp_path / "webcam" / "05.jpg"), np.full((480, 640), 128, dtype=np.uint8))  # nothing in it
     shown = []
 
     def progress(items, what):
@@ -224,5 +299,19 @@ def test_images_are_read_and_drawn(tmp_path):
     assert shown == [(5, "Detecting corners")]
     assert [image.corners > 0 for image in recording.images] == [True] * 4 + [False]
     assert recording.images[4].refused
-    assert recording.capture.observations[0].images == tuple(f"images/{row[:6]}" for row in rows[1:5])
+    assert recording.capture.observations[0].images == tuple(f"webcam/{row[:6]}" for row in rows[1:5])
     assert len([cv2.imread(str(path)).shape for path in overlays.iterdir()]) == 5
+    for image in recording.images:  # those refused too
+        small = cv2.imdecode(np.frombuffer(base64.b64decode(image.preview), np.uint8), cv2.IMREAD_UNCHANGED)
+        assert small.shape == (240, 320)
+    aj.files.save_capture(tmp_path / "capture.h5", recording)
+    assert aj.files.load_capture(tmp_path / "capture.h5").images == recording.images
+
+
+@pytest.mark.parametrize("picture", ["no base64!", "aGVsbG8=", JPEG_OF_HUGE_SIZE], ids=["text", "no JPEG", "huge"])
+def test_a_picture_in_a_file_that_a_browser_should_not_decode_is_refused(tmp_path, seen, picture):
+    files(tmp_path, seen)
+    recording = read(tmp_path)
+    recording = recording._replace(images=(recording.images[0]._replace(preview=picture), *recording.images[1:]))
+    aj.files.save_capture(tmp_path / "capture.h5", recording)
+    assert_refused(lambda: aj.files.load_capture(tmp_path / "capture.h5"), "not a small JPEG")

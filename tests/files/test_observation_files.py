@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
-from aacmm_jax.data.observations.observation import kinds as known_kinds
+from aacmm_jax.data.observations.simulated import kinds as known_kinds
 from aacmm_jax.files.hdf5_content import seal
 from tests.example_counts import example_count
 

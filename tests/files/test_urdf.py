@@ -334,4 +334,4 @@ def test_export_needs_the_urdf(paper_arm, nominal):
         "a URDF cannot be exported",
         "--format toml",
     )
-    assert_refused(lambda: urdf_of(aj.load_arm("panda"), nominal), "has 7 joints, but the URDF has 6")
+    assert_refused(lambda: urdf_of(aj.load_arm("panda"), nominal), "has 7 joints, but the chain has 6")

@@ -10,6 +10,7 @@ from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.diagnostics.missing_terms import FoundTerm, MissingTerm, wider_model
 from aacmm_jax.kinematics import parameter_names, with_corrections
 from aacmm_jax.kinematics.arm import correction_names
+from aacmm_jax.kinematics.beside import Readings
 from aacmm_jax.kinematics.chain import KnownFunctions, forward_pass, joint_motion, joints_first
 from aacmm_jax.kinematics.corrected_arm import function_values
 from aacmm_jax.kinematics.corrections import terms_of
@@ -106,8 +107,8 @@ def test_all_lengths_grow_with_the_temperature(name, request):
 
 def test_an_arm_that_is_wider_than_the_readings():
     arm = with_corrections(aj.load_arm("panda"), "expansion")
-    assert (arm.joints, arm.columns, arm.thermometer) == (7, 8, True)
-    assert not arm.replace(corrections=None, coefficients=None, gravity=None).replace(thermometer=False).thermometer
+    assert (arm.joints, arm.columns, arm.beside.possible) == (7, 8, ("thermometer",))
+    assert not arm.replace(corrections=None, coefficients=None, gravity=None).beside.possible
     with pytest.raises(aj.InputError, match="the arm has 7 joints, and a thermometer"):
         arm.position(np.zeros(9))
     with pytest.raises(aj.InputError, match="an arm with thermometer=True"):
@@ -122,7 +123,7 @@ def test_moment_of_gravity():
     for gravity, expected in (((0, 0, -1), moment), ((0, 0, -3), moment)):
         loaded = with_corrections(arm, "gravity=masses", mass=[0, 2], centre=[(0, 0, 0), (-100, 0, 0)], gravity=gravity)
         assert correction_names(loaded)[:-3] == ("compliance_2",)  # the first axis is vertical
-        (found,) = function_values(arm.geometry, loaded.corrections.functions.terms, q, np.asarray(loaded.gravity))
+        (found,) = function_values(loaded, loaded.corrections.functions.terms, q)
         np.testing.assert_allclose(found, [expected], rtol=1e-12)
         yielded = loaded.replace(compliance_2=0.1)
         np.testing.assert_allclose(yielded.position(q), arm.position(q + np.array([0, 0.1 * expected])), rtol=1e-12)
@@ -132,7 +133,7 @@ def test_moment_of_gravity():
     for model in ("gravity=masses", ["compliance_2"]):
         with pytest.raises(aj.InputError, match="needs the masses of the links"):
             with_corrections(arm, model)
-    (found,) = function_values(arm.geometry, unknown.corrections.functions.terms, q, np.asarray(unknown.gravity))
+    (found,) = function_values(unknown, unknown.corrections.functions.terms, q)
     np.testing.assert_allclose(found, -0.4 * np.cos(np.radians(30)), rtol=1e-12)
 
 
@@ -323,8 +324,8 @@ def test_functions_together_are_those_one_by_one():
     rows, forward = joints_first(q, 1), forward_pass(arm.geometry, joint_motion(arm.geometry, q))
     together, alone = KnownFunctions(each), [KnownFunctions((one,)) for one in each]
     assert together.names == tuple(names)
-    values = together.values(rows, forward)
-    np.testing.assert_array_equal(values, np.concatenate([one.values(rows, forward) for one in alone]))
+    values = together.values(Readings(rows), forward)
+    np.testing.assert_array_equal(values, np.concatenate([one.values(Readings(rows), forward) for one in alone]))
     for term, row in (
         (0, np.cos(q[:, 0])),
         (2, np.sin(3 * q[:, 1])),

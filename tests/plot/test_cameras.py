@@ -61,6 +61,22 @@ def test_far_residuals_have_a_tone_of_their_own(image):
     assert starts == pytest.approx(image.corners[5:6] - 40.0)
 
 
+def test_pictures_go_from_the_largest_residuals_to_the_smallest(image):
+    assert cameras.picture_charts(image) == []
+    shown = image._replace(pictures=["", *(f"{i}" for i in range(1, 12))], refused=[("x", "13: it is too dark")])
+    [used, refused] = cameras.picture_charts(shown)
+    rms = [float(plot.title.split(": ")[1].removesuffix(" px RMS")) for plot in used.plots]
+    assert rms == sorted(rms, reverse=True)
+    assert len(used.plots) == 6
+    for plot in used.plots:  # the arrows are those of the image whose picture is shown
+        starts, steps = arrows(plot.marks[1])
+        own = image.owner == int(plot.picture)
+        factor = float(used.description.split()[-4])
+        assert starts + steps / factor == pytest.approx(image.corners[own])
+    [plot] = refused.plots
+    assert (plot.picture, plot.title) == ("x", "13: it is too dark")
+
+
 def test_distortion_is_what_takes_ideal_pixels_to_distorted_ones(image):
     [plot] = cameras.distortion_chart(image).plots
     nodes, steps = arrows(plot.marks[1])
@@ -102,8 +118,9 @@ def test_figures(camera_record, record_without_cameras, name):
     axes = figure(camera_record)
     assert axes.has_data()
     if name != "camera_poses":
-        assert axes.get_xlim() == (-0.5, 639.5)
-        assert axes.get_ylim() == (479.5, -0.5)
+        margin = 40 if name == "camera_distortion" else 0  # for its arrows: a cell
+        assert axes.get_xlim() == (-0.5 - margin, 639.5 + margin)
+        assert axes.get_ylim() == (479.5 + margin, -0.5 - margin)
         assert_refused(lambda: figure(camera_record, "phone"), "no camera 'phone'", "webcam")
     assert_refused(lambda: figure(record_without_cameras), "has no camera", "pixels")
 

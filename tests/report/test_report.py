@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.data.recording import ReadImage
 from aacmm_jax.plot import charts, svg
 from aacmm_jax.plot.lengths import tried_shades
 from aacmm_jax.report import elements, write_report
@@ -59,11 +60,26 @@ def written(tmp_path_factory, observed_record, camera_records):
     aj.files.save_evaluation(folder / "evaluation.h5", evaluation)
     write_study(folder / "study.h5", aj.study.make_study(**{**STUDY, "arm": nominal.arm}))
     aj.files.save_calibration(folder / "observations.h5", with_hostile_names(observed_record))
-    aj.files.save_calibration(folder / "camera.h5", camera_records["fixed"])
+    aj.files.save_calibration(folder / "camera.h5", with_pictures(camera_records["fixed"]))
     pages = {kind: folder / f"{kind}.html" for kind in KINDS}
     for kind, page in pages.items():
         write_report(folder / f"{kind}.h5", page)
     return SimpleNamespace(folder=folder, pages=pages, record=record, evaluation=evaluation)
+
+
+JPEG = (  # a grey pixel
+    "/9j/4AAQSkZJRgABAQAAAQABAAD/2wBDAAMCAgICAgMCAgIDAwMDBAYEBAQEBAgGBgUGCQgKCgkICQkKDA8MCgsOCwkJDRENDg8QEBEQCgwSExIQEw8Q"
+    "EBD/wAALCAABAAEBAREA/8QAFAABAAAAAAAAAAAAAAAAAAAACf/EABQQAQAAAAAAAAAAAAAAAAAAAAD/2gAIAQEAAD8AVN//2Q=="
+)
+
+
+def with_pictures(record):
+    """The same calibration of a camera, with pictures of its images, whose names are hostile."""
+    [seen] = record.recording.capture.observations
+    names = tuple(f"{number} {HOSTILE}" for number in range(len(seen.q)))
+    images = tuple(ReadImage(seen.name, name, 6, preview=JPEG) for name in names)
+    capture = aj.Capture({}, (), [seen.changed(images=names)])
+    return record._replace(recording=record.recording._replace(capture=capture, images=images))
 
 
 def with_hostile_names(record):
@@ -141,7 +157,9 @@ def test_text_of_people_never_becomes_markup(page):
 
 def test_a_page_needs_nothing_else_and_is_small(page, written):
     links = [value for _, attributes in page.elements for name, value in attributes.items() if name in ("src", "href")]
-    assert all(link.startswith("#") or link == "data:," for link in links)
+    pictures = [link for link in links if link == f"data:image/jpeg;base64,{JPEG}"]
+    assert len(pictures) == (6 if page.kind == "camera" else 0)
+    assert all(link.startswith("#") or link == "data:," for link in links if link not in pictures)
     assert written.pages[page.kind].stat().st_size < 600_000
     policy = next(attributes["content"] for tag, attributes in page.elements if attributes.get("http-equiv"))
     assert "default-src 'none'" in policy

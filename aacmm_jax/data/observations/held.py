@@ -17,8 +17,6 @@ from .observation import (
     FRAME,
     POINT,
     AbstractObservation,
-    AbstractOfTarget,
-    AbstractSimulated,
     Certified,
     Parts,
     Quantity,
@@ -28,6 +26,7 @@ from .observation import (
     Transforms,
     Unknowns,
 )
+from .simulated import AbstractOfTarget, AbstractSimulated
 
 
 class Socket(AbstractObservation):

@@ -32,8 +32,6 @@ from .observation import (
     FRAME,
     POINT,
     AbstractObservation,
-    AbstractOfTarget,
-    AbstractSimulated,
     Parts,
     Readings,
     Rows,
@@ -42,6 +40,7 @@ from .observation import (
     Unknowns,
     offset_of,
 )
+from .simulated import AbstractOfTarget, AbstractSimulated
 
 _FLAT = 1e-6  # second singular value of points on a line, of the first
 _SAME = 1e-9  # mm

@@ -28,7 +28,6 @@ from .observation import (
     PLANE,
     POINT,
     AbstractObservation,
-    AbstractSimulated,
     Certified,
     Parts,
     Quantity,
@@ -38,6 +37,7 @@ from .observation import (
     Transforms,
     Unknowns,
 )
+from .simulated import AbstractSimulated
 
 SIDES = ("one", "other")
 # Smallest singular value of a touch's derivatives, of those by angles in units of the touches' own extent. With it a
