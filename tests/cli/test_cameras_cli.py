@@ -63,7 +63,7 @@ def test_what_a_camera_cannot_separate_is_said(aacmm, folder):
     """Zeros of the first and last joint from place and mount, and the tip; not where the arm is held altogether."""
     for options, said in ((("--no-automatic",), True), (("--arm-fixed",), False)):
         shown = " ".join(aacmm("calibrate", folder / "on-arm.h5", "-o", "c.h5", *options).stdout.split())
-        assert ("the place of board from theta_1 and d_1 or the mount of webcam from theta_6 and d_6" in shown) is said
+        assert ("the place of board from theta_1 and d_1 or the mount of webcam from theta_6." in shown) is said
         assert ("No observation shows the tip." in shown) is said
 
 
