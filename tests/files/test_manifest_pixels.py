@@ -75,7 +75,7 @@ def test_a_table_of_corners_is_read_and_comes_back_from_a_file(tmp_path, seen, i
     assert loaded.capture.observations[0].ids == pixels.ids
 
 
-@pytest.mark.parametrize("lists", ["all", "ids", "points", "plain"])
+@pytest.mark.parametrize("lists", ["all", "ids", "points", "plain", "records"])
 def test_nested_lists(tmp_path, seen, lists):
     files(tmp_path, seen, images=False)
     corners = np.asarray(seen.corners)[:, :, None, :].tolist()
@@ -85,6 +85,7 @@ def test_nested_lists(tmp_path, seen, lists):
         "ids": {"corners": corners, "ids": ids},
         "points": {"imgpoints": corners, "objpoints": points},
         "plain": corners,
+        "records": [{"image": f"{i}", "ids": ids[i], "image_points": corners[i]} for i in range(len(ids))],
     }[lists]
     (tmp_path / "corners.json").write_text(json.dumps(content))
     (pixels,) = read(tmp_path, KNOWN, [("corners.csv", "corners.json")]).capture.observations
@@ -172,6 +173,34 @@ def test_tables_that_make_no_sense_are_refused(tmp_path, seen, table, old, new, 
     assert old in text
     (tmp_path / table).write_text(text.replace(old, new, 1))
     assert_refused(lambda: read(tmp_path), *parts)
+
+
+@pytest.mark.parametrize("squares", [[9, 8], [5, 6]], ids=["larger", "turned"])
+def test_corners_that_cannot_be_those_of_the_target_are_refused(tmp_path, seen, squares):
+    files(tmp_path, seen)
+    changes = [("squares = [6, 5]", f"squares = {squares}")]
+    assert_refused(lambda: read(tmp_path, KNOWN, changes), "img_0.png", "another target, its rows and columns")
+
+
+def test_columns_named_as_the_joints_of_a_urdf_are_the_readings(tmp_path, seen):
+    """In any order, beside other columns of numbers; the arm of this URDF need not fit the images."""
+    names = ["pan", "lift", "elbow", "roll", "pitch", "yaw"]
+    links = "".join(f'<link name="l{i}"/>' for i in range(7))
+    joints = "".join(
+        f'<joint name="{name}" type="continuous"><parent link="l{i}"/><child link="l{i + 1}"/>'
+        f'<origin xyz="0.1 0 0.3"/><axis xyz="0 {i % 2} {1 - i % 2}"/></joint>'
+        for i, name in enumerate(names)
+    )
+    (tmp_path / "robot.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
+    files(tmp_path, seen)
+    table = (tmp_path / "joints.csv").read_text().splitlines()
+    cells = [row.split(",") for row in table[1:]]
+    header = ",".join(["image", "speed", *(f"{name} [deg]" for name in reversed(names))])
+    rows = [",".join([image, "7", *reversed(q)]) for image, *q in cells]
+    (tmp_path / "joints.csv").write_text("\n".join([header, *rows]) + "\n")
+    (tmp_path / "capture.toml").write_text('arm = "robot.urdf"\n' + TARGET + CAMERA + PIXELS)
+    recording = aj.files.read_manifest(tmp_path / "capture.toml")
+    np.testing.assert_allclose(recording.capture.observations[0].q, seen.q, atol=1e-12)
 
 
 def line(image, i, u, v):
@@ -268,6 +297,20 @@ def test_corners_are_detected_once_where_readings_are_commanded_and_measured(tmp
     recording = aj.files.read_manifest(tmp_path / "webcam.toml")
     assert recording.other_readings.role == "commanded"
     assert len(recording.other_readings.capture.observations[0].q) == len(detected) == 2
+
+
+def test_a_damaged_image_and_one_of_too_many_pixels_are_not_used(tmp_path):
+    """A sentence for each; the others are used."""
+    cv2 = pytest.importorskip("cv2")
+    part_of_example(tmp_path, 5)
+    images = sorted((tmp_path / "webcam").iterdir())
+    images[3].write_bytes(images[3].read_bytes()[:3000])
+    bomb = cv2.imencode(".png", np.zeros((12_000, 12_000), dtype=np.uint8))[1].tobytes()
+    images[4].write_bytes(bomb)
+    recording = aj.files.read_manifest(tmp_path / "webcam.toml")
+    assert [image.corners > 0 for image in recording.images] == [True] * 3 + [False] * 2
+    for image in recording.images[3:]:
+        assert image.refused == "is not an image that OpenCV reads, is damaged, or has more than 120 million px"
 
 
 def test_images_are_read_and_drawn(tmp_path):
