@@ -51,7 +51,11 @@ def inside(grey: Grey, places: Float[np.ndarray, "k 2"], border: float) -> np.nd
 
 
 def fitting(
-    target: AbstractTarget, ids: Int[np.ndarray, " k"], corners: Float[np.ndarray, "k 2"], spacing: float
+    target: AbstractTarget,
+    ids: Int[np.ndarray, " k"],
+    corners: Float[np.ndarray, "k 2"],
+    spacing: float,
+    size: tuple[int, ...],
 ) -> Bool[np.ndarray, " k"]:
     """Which corners are where the target has them; those beside what hides the target in part are not.
 
@@ -59,14 +63,14 @@ def fitting(
     """
     points, kept = target.points_of(ids), np.arange(len(ids))
     while len(kept):
-        misfit = misfits(points[kept], corners[kept])
+        misfit = misfits(points[kept], corners[kept], size)
         worst = misfit.max()
         if worst <= max(_MOST_MEDIANS * float(np.median(misfit)), _LEAST_MISFIT):
             break
         kept = np.delete(kept, np.argmax(misfit))
     if len(kept) < (1 - _MOST_APART) * len(ids) or (len(kept) and worst > max(_MISFIT * spacing, 2 * _LEAST_MISFIT)):
         raise Refusal(
-            f"corners are {misfits(points, corners).max():.1f} px from where the target has them: the sizes stated are "
-            "not in the right ratio, it is hidden in part, or a board is not flat"
+            f"corners are {misfits(points, corners, size).max():.1f} px from where the target has them: the sizes "
+            "stated are not in the right ratio, it is hidden in part, or a board is not flat"
         )
     return np.isin(np.arange(len(ids)), kept)

@@ -349,7 +349,7 @@ def _at_temperature(commanded: Any, calibrated: Any, temperature: float | None) 
     from ..files.table_columns import TEMPERATURE
     from ..kinematics.arm import correction_names
     from ..kinematics.corrected_arm import loads_of
-    from ..kinematics.correction_kinds import Expansion
+    from ..kinematics.recorded_kinds import Expansion
 
     torques = calibrated.corrections is not None and "torques" in calibrated.corrections.functions.columns
     if torques and loads_of(calibrated) is None:

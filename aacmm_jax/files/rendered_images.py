@@ -66,6 +66,8 @@ def save_images(
         entry = images_table(observation, "one row per image", "jpg")
         names = [f"{pose:0{len(str(len(observation.q)))}d}.jpg" for pose in range(1, 1 + len(observation.q))]
         images = folder / Path(entry["images"]).parent
+        if images.resolve().parent != folder.resolve():
+            raise InputError(f"'{observation.name}' cannot be the name of a folder; give [[pixels]] another name.")
         images.mkdir(parents=True, exist_ok=True)
         seeds = np.random.SeedSequence((recording.seed or 0, number)).generate_state(len(names)).tolist()
         for pose in progress(range(len(names)), f"Rendering images of {observation.camera}"):

@@ -340,6 +340,12 @@ def _joints_before(robot: Robot, link: str) -> list[UrdfJoint]:
     return joints
 
 
+def joint_names(source: UrdfSource) -> list[str]:
+    """The names of the moving joints of the chain, from the base."""
+    path = _joints_between(parse_robot(source.text), source.base, source.tip)
+    return [joint.name for joint in path if joint.kind != "fixed"]
+
+
 def _joints_between(robot: Robot, base: str, tip: str) -> list[UrdfJoint]:
     """The joints from base to tip."""
     back = _joints_before(robot, tip)

@@ -21,10 +21,10 @@ TURNED = '<joint name="to_world" type="fixed"><origin xyz="0.1 0.2 0.3" rpy="0.1
 NUMBER = r"[-−]?\d[\d.]*(?:e-?\d+)?"
 
 
-SLOW = (pytest.param(case, marks=pytest.mark.slow) for case in ("moving link", "tool"))
+pytestmark = pytest.mark.slow  # in the suite, tests/summaries/test_camera_rows.py
 
 
-@pytest.fixture(scope="module", params=["tip link", *SLOW])
+@pytest.fixture(scope="module", params=["tip link", "moving link", "tool"])
 def calibrated(request, tmp_path_factory):
     """A calibration of an arm from a URDF whose base is turned: up to a link that a fixed joint bears, up to one that
     moves, or with a tool beyond the tip link."""

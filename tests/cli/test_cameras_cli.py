@@ -31,6 +31,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_hand_eye_calibration(aacmm, folder, tmp_path):
     shown = aacmm("calibrate", folder / "on-arm.h5", "-o", "c.h5", "--arm-fixed").stdout
     for part in ("with the arm as it is", "reprojection error 0.", "at the target", "mount of webcam", "exact"):
@@ -51,6 +52,7 @@ def test_hand_eye_calibration(aacmm, folder, tmp_path):
     assert "--camera" in aacmm("export", "c.h5", "--camera", "webcam", expect=2).stderr
 
 
+@pytest.mark.slow
 def test_a_camera_that_stands_still(aacmm, folder):
     aacmm("calibrate", folder / "fixed.h5", "-o", "c.h5", "--arm-fixed")
     (row,) = json.loads(aacmm("show", "c.h5", "--json").stdout)["cameras"]
@@ -97,6 +99,7 @@ poses = 3
 SIMULATE = ("simulate", "ur10e", "-o", "s.h5", "--kit", "kit.toml")
 
 
+@pytest.mark.slow
 def test_rendered_images_are_read_as_they_were_simulated(aacmm, tmp_path):
     """Readings with their noise, a board that was printed too small; the corners without bias."""
     pytest.importorskip("cv2")
@@ -119,9 +122,10 @@ def test_rendered_images_are_read_as_they_were_simulated(aacmm, tmp_path):
     [
         (KIT, ("--blur-px", "1"), "--images FOLDER"),
         (KIT.replace("intrinsics =", "# "), (), "'webcam' has no intrinsics"),
+        (KIT.replace('"looks"', '".."'), (), "cannot be the name of a folder"),
         ('[[socket]]\nname = "cone"\npoint = [400, 200, 300]\nposes = 2\n', (), "no camera"),
     ],
-    ids=["no images", "no intrinsics", "no camera"],
+    ids=["no images", "no intrinsics", "folder above", "no camera"],
 )
 def test_images_that_cannot_be_rendered_are_refused(aacmm, tmp_path, kit, options, says):
     (tmp_path / "kit.toml").write_text(kit)
