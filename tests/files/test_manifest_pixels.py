@@ -80,14 +80,14 @@ def test_a_column_divides_the_images_into_groups(tmp_path, seen):
     """Observations of one camera and one target, which can be held out by name."""
     files(tmp_path, seen)
     lines = (tmp_path / "joints.csv").read_text().splitlines()
-    places = ["place", *("left" if i % 3 else "right" for i in range(12))]
+    places = ["place", *("left" if i % 3 else "right" for i in range(len(seen.q)))]
     (tmp_path / "joints.csv").write_text("\n".join(f"{a},{b}" for a, b in zip(lines, places, strict=True)))
     recording = read(tmp_path, changes=[('corners = "corners.csv"\n', 'corners = "corners.csv"\ngroup = "place"\n')])
     right, left = recording.capture.observations
     assert [part.name for part in (right, left)] == ["webcam/right", "webcam/left"]
     assert (right.camera, right.board) == (left.camera, left.board) == ("webcam", "board")
     np.testing.assert_allclose(right.corners, np.asarray(seen.corners)[::3], atol=1e-6)
-    assert [image.observation for image in recording.images].count("webcam/left") == 8
+    assert [image.observation for image in recording.images].count("webcam/left") == len(left.q)
     kept = without_held_out(recording.capture, held_out_poses(recording.capture, "webcam/right", None, 0))
     assert [part.name for part in kept.observations] == ["webcam/left"]
 
