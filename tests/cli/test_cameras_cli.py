@@ -61,6 +61,7 @@ def test_a_camera_that_stands_still(aacmm, folder):
     assert aacmm("export", "c.h5", "--format", "matrix", "--frame", "place").stdout.startswith("# webcam in base, mm")
 
 
+@pytest.mark.slow
 def test_what_a_camera_cannot_separate_is_said(aacmm, folder):
     """Zeros of the first and last joint from place and mount, and the tip; not where the arm is held altogether."""
     for options, said in ((("--no-automatic",), True), (("--arm-fixed",), False)):
