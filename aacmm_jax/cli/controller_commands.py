@@ -254,6 +254,7 @@ def _certificate(calibration: InputFile, record: Any, about: Path | None, evalua
 
 @command(
     "aacmm correct calibration.h5 poses.csv -o corrected.csv --unit deg",
+    "aacmm correct calibration.h5 points.csv -o commanded.csv --unit deg --near 0,-90,90,0,90,0 --write poses",
     "aacmm correct calibration.h5 poses.csv -o corrected.csv --unit deg --near 0,-90,90,0,90,0 --probe 0,0,150",
 )
 def correct(
@@ -292,9 +293,14 @@ def correct(
         "temperature_C of the table.",
         "C",
     ),
+    write: Literal["readings", "poses"] = option(
+        "What to write: corrected joint readings, or, for a controller that takes poses only, the corrected poses to "
+        "command, in the units and columns of the table.",
+        default="readings",
+    ),
     as_json: bool = options.JSON,
 ) -> None:
-    """Turn commanded poses into corrected joint readings.
+    """Turn commanded poses into corrected joint readings, or into corrected poses.
 
     A controller that uses the nominal parameters expects the tip in the pose that the nominal arm has at the commanded
     joint readings. The corrected readings bring the tip of the calibrated arm to this pose. The nominal and the
@@ -309,9 +315,13 @@ def correct(
     The output table has the columns and the unit of the input table. If the pose of a row cannot be reached within the
     joint limits of the nominal arm, its readings are left empty and the exit code is 1. Do not send an arm to such a
     pose.
+
+    A table of positions without orientations needs --near; the tool keeps the orientation that the nominal arm has at
+    these readings. Corrected poses (--write poses) hold for a controller that computes joint readings with the nominal
+    parameters and in the configuration (elbow, wrist) of the readings given.
     """
     from ..core.numpy_or_jax import to_numpy
-    from ..files.table_columns import corrected_csv, read_poses
+    from ..files.table_columns import corrected_csv, corrected_poses_csv, read_poses
 
     begin = None if near is None else numbers_option("--near", near, "Q1,Q2,... with one reading per joint")
     picked = None if columns is None else [int(x) if x.isdecimal() else x for x in names_option(columns)]
@@ -325,11 +335,18 @@ def correct(
             InputFile(poses), nominal, unit=unit, near=begin, columns=picked, length_unit=length_unit
         )
         q = _at_temperature(commanded, calibrated, temperature)
-        if commanded.poses is None:
-            corrected = kinematics.corrected_readings(nominal, calibrated, q)
+        meant = np.array(nominal.pose(q[:, : nominal.joints]))
+        oriented = commanded.oriented or commanded.poses is None
+        targets = meant if commanded.poses is None else in_first_frame(record, commanded.poses)
+        targets[:, :3, :3] = targets[:, :3, :3] if oriented else meant[:, :3, :3]
+        if write == "poses":
+            to_command, corrected = kinematics.corrected_targets(nominal, calibrated, q, targets, oriented=oriented)
+            base = first_frame(record.recording.nominal)
+            in_file = to_command if base is None else base @ to_command
+            text = corrected_poses_csv(commanded, in_file, np.asarray(corrected.reached))
         else:
-            targets = in_first_frame(record, commanded.poses)
             corrected = kinematics.readings_at_poses(calibrated, q, targets, nominal.limits)
+            text = corrected_csv(commanded, np.asarray(corrected.q), np.asarray(corrected.reached))
         summary = summaries.correction.correction_summary(
             nominal, calibrated, q, corrected, unit=commanded.unit, of_readings=commanded.poses is None
         )
@@ -339,7 +356,7 @@ def correct(
                 "The arm was calibrated without thermal expansion, so the column temperature_C has no effect; "
                 "calibrate with --model expansion to correct for temperature."
             )
-        write_text(output, corrected_csv(commanded, np.asarray(corrected.q), np.asarray(corrected.reached)))
+        write_text(output, text)
         summary["written"] = str(output)
     warn_of_unusable(calibration, record)
     show_summary(summary, as_json, summaries.correction.corrections)
