@@ -228,6 +228,10 @@ def test_every_import_of_another_package_is_declared():
         "xarray",  # the extra data
         "distributed",  # the extra dask
         "cv2",  # the extra camera
+        "openpyxl",  # the extra excel
+        "rosbags",  # the extra ros
+        *("backports", "compression"),  # comes with rosbags; of Python 3.14
+        "pyarrow",  # the extra lerobot
         *(each.split(">=")[0] for each in DEPENDENCIES),
     }
     imported = set()

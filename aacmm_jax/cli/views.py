@@ -95,6 +95,7 @@ def capture(summary: dict[str, Any]) -> View:
         if stated:
             yield f"{row['observation']}: {shorten(stated, _MOST_PARTS)}."
     yield from images_words(summary.get("images") or ())
+    yield from (f"{note}." for note in summary.get("notes") or ())
     slides = any("lowest_mm" in row for row in summary["ranges"])
 
     def reading(row: dict[str, Any], end: str) -> Any:

@@ -9,7 +9,10 @@ from .text import in_short, quoted
 
 _COMPARED = 200  # characters of a word: comparing takes their square
 # By extra of pyproject.toml, the package whose presence says whether it is installed.
-_PACKAGES = {"plot": "matplotlib", "report": "jinja2", "data": "xarray", "dask": "distributed", "camera": "cv2"}
+_PACKAGES = {
+    "plot": "matplotlib", "report": "jinja2", "data": "xarray", "dask": "distributed", "camera": "cv2",
+    "excel": "openpyxl", "ros": "rosbags", "lerobot": "pyarrow",
+}  # fmt: skip
 
 
 class InputError(ValueError):

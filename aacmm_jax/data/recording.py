@@ -109,6 +109,8 @@ class Recording(NamedTuple):
         stated: What somebody stated of how it is to be read, which no search for mistakes overrules: "columns", "sign",
             "offset" and "unit" of the joint readings, "units" of measured points.
         images: What was found in each image of a target.
+        notes: What was read of files that hold more than a table, such as the poses in which an arm stood still; files
+            of captures do not keep them.
         other_readings: Where its tables hold commanded and measured readings: those that the capture does not have;
             files of captures do not keep them.
 
@@ -131,4 +133,5 @@ class Recording(NamedTuple):
     as_found: ArmSpecification | None = None
     stated: tuple[str, ...] = ()
     images: tuple[ReadImage, ...] = ()
+    notes: tuple[str, ...] = ()
     other_readings: ReadingSet | None = None

@@ -45,18 +45,15 @@ class Seen(NamedTuple):
     preview: str | None = None  # small picture (JPEG, base64)
 
 
-def read_corners(file: InputFile, target: AbstractTarget, dimensions: int, columns: Mapping[Any, Picked]) -> list[Seen]:
-    """The corners of each image, in the order of the file.
+def corners_of_table(text: TextTable, dimensions: int, columns: Mapping[Any, Picked]) -> list[Seen]:
+    """The corners of each image, in the order of a table with the columns image, id, u, v (or x, y, z).
 
     Args:
-        file: text table with the columns image, id, u, v (or x, y, z), or JSON with a list for each image.
-        target: the points that were seen.
+        text: the table.
         dimensions: of a corner: 2, or 3 of a camera that measures points.
         columns: where the names of the columns are others: image, id, corners.
     """
-    if str(file).lower().endswith(".json"):
-        return _of_json(file, target, dimensions)
-    text = TextTable(file, decimal=None)
+    file = text.path
     choices = _NAMES | {"corners": _AXES[dimensions]}
     picked: dict[str, Sequence[Column]] = {}
     for key, names in choices.items():
@@ -79,7 +76,9 @@ def read_corners(file: InputFile, target: AbstractTarget, dimensions: int, colum
     return [Seen(label, ids[labels == label].astype(int), corners[labels == label]) for label in images]
 
 
-def _of_json(file: InputFile, target: AbstractTarget, dimensions: int) -> list[Seen]:
+def corners_of_json(file: InputFile, target: AbstractTarget, dimensions: int) -> list[Seen]:
+    """The corners of each image in JSON with a list for each image; arguments as of `corners_of_table`, and the target
+    that was seen."""
     text = file.text
     try:
         content: Any = json.loads(text)

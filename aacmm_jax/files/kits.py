@@ -121,7 +121,7 @@ def read_kit(path: str | os.PathLike) -> list[KitItem]:
                 transforms[:, :3, 3] = tips
                 simulated.recorded(np.zeros((len(tips), 1)), transforms, np.random.default_rng(0))
             items.append(KitItem(simulated, places, turned, half_angle, tuple(normal)))
-    cameras = Cameras(Source(InputFile(path), "q", lambda *_: np.zeros((0, 0))), content.camera, content.target)
+    cameras = Cameras(Source(InputFile(path), "q"), content.camera, content.target)
     for entry in content.pixels:
         with naming(f"{path}: [[pixels]] '{entry.name}'"):
             items.append(KitItem(_pixels(entry, cameras), places=0))

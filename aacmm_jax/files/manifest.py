@@ -21,6 +21,7 @@ from ..kinematics.parameters import ArmSpecification
 from ..kinematics.workspace import Reach
 from .arms import arm_beside, for_capture, read_arm, usual_noise
 from .inputs import InputFile
+from .lerobot_motors import angles_by_motors
 from .manifest_pixels import Cameras, Detecting, Progress, observations_of, without_progress
 from .manifest_readings import Readings, points_of
 from .manifest_rows import Source, name_of, parts
@@ -82,8 +83,11 @@ def _read(path: str | os.PathLike, detecting: Detecting = _QUIETLY) -> tuple[Rec
     with naming(path):
         arm = arm_beside(path.parent, model.arm)
         nominal, proposed = read_arm(arm, base=model.base, tip=model.tip, probe=model.probe)
-        readings = Readings(nominal.arm, model.angles)
-        source = Source(manifest, "q", readings)
+        source = Source(manifest, "q")
+        angles = model.angles
+        if angles is not None and angles.calibration is not None:
+            angles = angles_by_motors(angles, source.open(angles.calibration), nominal.arm.joints)
+        source.rows = readings = Readings(nominal.arm, angles)
         sockets, lengths, spheres = _read_recorded(model, source)
         observed: list[tuple[str, Any]] = [(seat.session, seat) for seat in sockets.values() if not seat.target]
         # Where another tip than the arm's own probe was held, it is an observation.
@@ -124,6 +128,7 @@ def _read(path: str | os.PathLike, detecting: Detecting = _QUIETLY) -> tuple[Rec
             as_found=as_found,
             stated=_stated(model),
             images=tuple(images),
+            notes=tuple(source.notes),
         )
         return recording, readings
 
@@ -175,7 +180,8 @@ def read_points(path: str | os.PathLike) -> Measured:
     model = read_toml(manifest := InputFile(path), PointsManifest)
     stated = model.points
     with naming(as_path(path)):
-        source = Source(manifest, "points", lambda text, wanted: points_of(text, wanted, stated))
+        source = Source(manifest, "points")
+        source.rows = lambda text, wanted: points_of(text, wanted, stated)
         seated, lengths, spheres = _read_recorded(model, source)
         for length in lengths:
             for end in (length.start, length.end):

@@ -34,13 +34,14 @@ class TargetTable(Strict):
     first: NonNegativeInt | None = None  # id of the first tag
     bar: Bar | None = None
     file: str | None = None  # of points: id, x, y, z
+    table: str | None = None  # in that file
     columns: dict[str, Picked] = Field(default_factory=dict)
     units: dict[str, str] = Field(default_factory=dict)
 
     @property
     def keys(self) -> dict[str, Any]:
         """What `target_of` takes; of a table of points without these."""
-        return self.model_dump(exclude_unset=True, exclude={"name", "file", "columns", "units"})
+        return self.model_dump(exclude_unset=True, exclude={"name", "file", "table", "columns", "units"})
 
 
 class CameraTable(Strict):
@@ -71,6 +72,7 @@ class PixelsTable(NamedTable):
     on_arm: Literal["camera", "target"] = "camera"
     images: str | None = None  # path with wildcards
     corners: str | None = None  # table: image, id, u, v; or JSON
+    corner_table: str | Annotated[list[str], Field(min_length=1)] | None = None  # in that file
     corner_columns: Mapping[Literal["image", "id", "corners"], Picked] = Field(default_factory=dict)
     u: PositiveFloat | None = None  # px, or mm of a camera that measures points
 

@@ -1,7 +1,7 @@
 """What a table of a manifest says of its files: paths, columns, units; and presets of these."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 from pydantic import AfterValidator, Field, FiniteFloat, NonNegativeFloat, NonNegativeInt, PositiveInt, model_validator
 
@@ -41,6 +41,8 @@ PRESETS = {
         coverage_factor=2.0,
     ),
     # Point lists with the direction in which a point was probed, which is not needed.
+    # Recordings of ROS: m, rad and the order of quaternions as REP 103 and geometry_msgs have them.
+    "ros": Preset({"points": [["x", "y", "z"]], "rotations": [["qx", "qy", "qz", "qw"]]}, rotation="quaternion xyzw"),
     "xyzijk": Preset({"points": [["X", "Y", "Z"], [1, 2, 3]]}),
     # christianlandgraf/ipa-robot-accuracy, its own files (semicolons, decimal commas) and tables with units in their
     # names; R = Rx(rx) Ry(ry) Rz(rz) is the order that agrees with the robot's joints.
@@ -61,11 +63,12 @@ PRESETS = {
 }
 
 
+Named = TypeVar("Named", str, int, Column)
 Picked = PositiveInt | str | Annotated[list[PositiveInt | str], Field(min_length=1)]
 
 
-def as_list(picked: Column | list[Column]) -> list[Column]:
-    """Columns as they are picked: one of them is a list, too."""
+def as_list(picked: Named | list[Named]) -> list[Named]:
+    """What is picked: one thing is a list, too."""
     return picked if isinstance(picked, list) else [picked]
 
 
@@ -74,7 +77,8 @@ class Table(Strict):
 
     file: str | None = None
     files: Annotated[list[str], Field(min_length=1), AfterValidator(each_once)] | dict[str, str] | None = None
-    preset: Literal["csv", "leica", "xyzijk", "ipa"] | None = None
+    table: str | Annotated[list[str], Field(min_length=1), AfterValidator(each_once)] | None = None  # in the file
+    preset: Literal["csv", "leica", "xyzijk", "ipa", "ros"] | None = None
     columns: Picked | dict[str, Picked] = Field(default_factory=dict)
     units: dict[str, str] = Field(default_factory=dict)
     delimiter: Literal[",", ";", "\t", " "] | None = None

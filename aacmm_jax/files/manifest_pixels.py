@@ -19,14 +19,13 @@ from ..data.observations.pixels import Pixels
 from ..data.recording import ReadImage
 from ..data.targets import AbstractTarget, target_of
 from .camera_files import read_camera
-from .corner_files import NO_CORNERS, Seen, matched, natural_order, read_corners
+from .corner_files import NO_CORNERS, Seen, corners_of_json, corners_of_table, matched, natural_order
 from .manifest_cameras import CameraTable, PixelsTable, TargetTable
 from .manifest_files import as_list
 from .manifest_readings import checked_unit
 from .manifest_rows import Source, parts
 from .outputs import write_atomically
 from .patterns import fill
-from .text_table import TextTable
 
 _FEWEST = 4  # corners of an image that determine the pose of a board
 Progress = Callable[[Sequence[Any], str], Iterable[Any]]  # shows how many of the items are done
@@ -86,7 +85,7 @@ class Cameras:
 
 def _points_of(source: Source, table: TargetTable) -> dict[str, Any]:
     """Ids and coordinates, mm, of a table of points."""
-    text = TextTable(source.open(str(table.file)), decimal=None)
+    text = source.table(str(table.file), decimal=None, tables=as_list(table.table or []))
     ids = text.numbers(text.pick(as_list(table.columns.get("id", "id"))))[:, 0]
     picked = text.pick(as_list(table.columns.get("points", ["x", "y", "z"])))
     if len(picked) != 3:
@@ -193,8 +192,12 @@ def _seen(
 ) -> list[Seen]:  # fmt: skip
     """The corners of each image: detected, or read from a table."""
     if entry.corners is not None:
-        file = source.open(fill(entry.corners, values))
-        return read_corners(file, target, camera_models()[camera.model].dimension, entry.corner_columns)
+        file, dimension = fill(entry.corners, values), camera_models()[camera.model].dimension
+        if file.lower().endswith(".json"):
+            return corners_of_json(source.open(file), target, dimension)
+        named = as_list(entry.corner_table or (entry.table if file in entry.paths else None) or [])
+        text = source.table(file, decimal=None, tables=named, corners=dimension)
+        return corners_of_table(text, dimension, entry.corner_columns)
     pattern = fill(str(entry.images), values)
     size = None if camera.image_size is None else tuple(int(number) for number in camera.image_size)
     found, key = {} if detecting.found is None else detecting.found, (pattern, fill(entry.target, values), size)

@@ -19,6 +19,7 @@ from .manifest_files import PRESETS, Preset, as_list
 from .manifest_readings import Wanted, checked_unit
 from .manifest_tables import NUMBERS_OF_ROTATION
 from .patterns import check_name, fields_of, fill
+from .table_sources.sources import InputFolder, input_table, is_recording
 from .text_lines import TABLE_SHARE, Column
 from .text_table import TextTable
 
@@ -29,16 +30,29 @@ _UNITS = {"rad": ANGLE_UNITS, "1": ANGLE_UNITS, "px": {"px": 1.0}}
 class Source:
     """The files of a manifest, to whose folder their paths are relative, in the order in which they are opened.
 
-    ``quantity`` is what a pose is: q (readings), or points; ``rows`` makes the poses of a table, rad and mm.
+    ``quantity`` is what a pose is: q (readings), or points; ``rows``, set before tables are read, makes the poses of a
+    table, rad and mm.
     """
 
-    def __init__(self, manifest: InputFile, quantity: str, rows: Callable[[TextTable, Wanted], np.ndarray]):
-        self.folder, self.quantity, self.rows, self._files = Path(manifest).parent, quantity, rows, [manifest]
+    rows: Callable[[TextTable, Wanted], np.ndarray]
+
+    def __init__(self, manifest: InputFile, quantity: str):
+        self.folder, self.quantity, self._files = Path(manifest).parent, quantity, [manifest]
+        self.notes: dict[str, None] = {}  # what was read of files that are more than a table
 
     def open(self, path: str) -> InputFile:
         """Read another file."""
         self._files.append(InputFile(self.folder / path, TABLE_SHARE))
         return self._files[-1]
+
+    def table(self, path: str, **options: Any) -> TextTable:
+        """Read another file, or folder, as a `TextTable` with these options."""
+        opened = input_table(self.folder / path, TABLE_SHARE)
+        self._files += opened.files if isinstance(opened, InputFolder) else [opened]
+        table = TextTable(opened, **options)
+        if table.note:
+            self.notes[f"{path}: {table.note}"] = None
+        return table
 
     def fingerprints(self) -> tuple[str, ...]:
         """The `fingerprint` of each file."""
@@ -114,7 +128,8 @@ class _Reader:
 
     def __init__(self, source: Source, kind: type[Declared], table: Any, where: str):
         self._source, self._table, self._where = source, table, where
-        preset = PRESETS[table.preset] if table.preset is not None else Preset({})
+        usual = "ros" if is_recording(source.folder / table.paths[0]) else None
+        preset = PRESETS.get(table.preset or usual or "", Preset({}))
         self._preset = preset._replace(columns={**getattr(kind, "usual", {}), **preset.columns})
         # In a manifest of points, a point stands where a pose has its readings.
         self.entries = {source.quantity if entry.name == "q" else entry.name: entry for entry in kind.entries}
@@ -143,7 +158,7 @@ class _Reader:
     def read(self, label: str, file: str, session: str) -> dict[str, Any]:
         """Of each pose of a file what its columns hold, its group and its session."""
         table, source = self._table, self._source
-        text = self._open(file, table.skip)
+        text = self._open(file, table.table, table.skip)
         chosen = dict(self._columns)
         for key, choices in self._preset.columns.items():
             # A preset may name more than a kind needs, or than a table has.
@@ -162,7 +177,7 @@ class _Reader:
             )
         of_session, main = chosen.pop("session", None), chosen.pop(source.quantity, None)
         others = [*chosen.values(), of_session or [], [] if table.group is None else [table.group]]
-        readings = text if self._own_file is None else self._open(self._own_file, 0)
+        readings = text if self._own_file is None else self._open(self._own_file, table.readings_table, 0)
         wanted = Wanted(
             main,
             table.units.get(source.quantity),
@@ -184,11 +199,12 @@ class _Reader:
                 )
         return rows_of
 
-    def _open(self, file: str, skip: int) -> TextTable:
+    def _open(self, file: str, tables: str | list[str] | None, skip: int) -> TextTable:
         table = self._table
         wanted = [*(column for columns in self._columns.values() for column in columns), table.group or 1]
-        return TextTable(
-            self._source.open(file),
+        return self._source.table(
+            file,
+            tables=as_list(tables or []),
             delimiter=table.delimiter,
             decimal=table.decimal or self._preset.decimal,
             skip=skip,

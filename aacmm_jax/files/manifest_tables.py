@@ -52,7 +52,7 @@ def _rotation(text: str) -> str:
 class Angles(Strict):
     """How every column of readings is turned into rad, or mm of a prismatic joint."""
 
-    unit: Literal["rad", "deg", "arcsec", "gon", "mrad", "counts"]
+    unit: Literal["rad", "deg", "arcsec", "gon", "mrad", "counts", "percent"]
     counts_per_turn: _ByJoint | None = None
     sign: Literal[1, -1] | list[Literal[1, -1]] = 1
     offset: FiniteFloat | list[FiniteFloat] = 0.0
@@ -62,8 +62,19 @@ class Angles(Strict):
     linear_unit: Literal["mm", "m", "um", "inch", "counts"] = "mm"  # of prismatic joints
     counts_per_mm: _ByJoint | None = None
 
+    calibration: str | None = None  # LeRobot's file of the motors
+
     @model_validator(mode="after")
     def _counts(self) -> "Angles":
+        if self.calibration is not None:
+            if self.counts_per_turn is not None or self.unit not in ("counts", "deg", "percent"):
+                raise ValueError(
+                    "calibration states how LeRobot's numbers become angles, so unit must be 'counts', 'deg' or "
+                    "'percent', without counts_per_turn."
+                )
+            return self
+        if self.unit == "percent":
+            raise ValueError("unit = 'percent' is LeRobot's -100 to 100; add calibration, the file of its motors.")
         if (self.unit == "counts") != (self.counts_per_turn is not None):
             raise ValueError("counts_per_turn and unit = 'counts' are only possible together; give both or neither.")
         if (self.linear_unit == "counts") != (self.counts_per_mm is not None):
@@ -112,6 +123,7 @@ class _Table(NamedTable):
     """What the tables of all other kinds have in common."""
 
     readings: str | None = None  # file of the readings, in the same order
+    readings_table: str | None = None  # in that file
     rotation: Annotated[str, AfterValidator(_rotation)] | None = None
     coverage_factor: PositiveFloat | None = None  # of the columns of u
 

@@ -5,18 +5,22 @@ SHA-256 at the end of a file detects what happened to it by chance, but anybody 
 reads all of a file first, in the way in which it will be read here. Where it does not come to the end, the file is
 refused. The child serves all files up to the first that is refused, then another is started; it ends with this process,
 whose pipe to it is then closed. It is a new interpreter and no fork: threads of JAX may hold locks.
+
+Tables in files that are not text are read by the child alone, which returns their lines: a few bytes of such a file may
+unpack to gigabytes, and their libraries are as little prepared for damage as that of HDF5.
 """
 
 import atexit
 import contextlib
 import faulthandler
+import importlib
 import json
 import os
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +29,8 @@ from ..core.errors import InputError
 # An intact file takes some milliseconds, and little more memory than its own size.
 _CPU_SECONDS, _SECONDS_PER_MIB, _CLOCK_PER_CPU = 2.0, 1.0, 30
 _MEMORY = 256 * 2**20
+# Of a table: compressed ones unpack to tens of times their size, and are slow to read where each cell is an object.
+_TABLE_SECONDS, _TABLE_SECONDS_PER_MIB, _TABLE_MEMORY = 10.0, 3.0, 2**30
 _MOST_SEALS = 100_000
 _vouched_for: set[str] = set()
 _READY = b"ready\n"
@@ -43,6 +49,11 @@ def vouch_for(seal: str) -> None:
     _vouched_for.add(seal)
 
 
+def _has_interpreter() -> bool:
+    """A program that contains Python may have none beside it."""
+    return bool(sys.executable) and not getattr(sys, "frozen", False)
+
+
 def read_through(path: str | os.PathLike, source: Any, size: int, largest: int, seal: str) -> None:
     """Raise `InputError` where HDF5 cannot read a file, or what is in it is not what files of this package contain.
 
@@ -50,7 +61,7 @@ def read_through(path: str | os.PathLike, source: Any, size: int, largest: int, 
     """
     if seal in _vouched_for:
         return
-    if not sys.executable or getattr(sys, "frozen", False):  # a program that contains Python may have none beside it
+    if not _has_interpreter():
         from .hdf5_content import check
 
         check(str(path), source, size, largest)
@@ -74,6 +85,45 @@ def read_through(path: str | os.PathLike, source: Any, size: int, largest: int, 
     if answer:
         raise InputError(answer)
     vouch_for(seal)
+
+
+def read_apart(
+    path: str | os.PathLike, module: str, members: Mapping[str, bytes], options: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What ``read(members, **options)`` of a module of this package returns, from the child: values that JSON can hold.
+
+    ``members`` are the contents of the files by name. Its `InputError` says what is wrong as a predicate: "has no
+    sheet". Raises `InputError` that begins with the path, also where the child does not come to the end.
+    """
+    size = sum(map(len, members.values()))
+    seconds = _TABLE_SECONDS + _TABLE_SECONDS_PER_MIB * size / 2**20
+    request = {
+        "path": str(path),
+        "module": module,
+        "options": dict(options),
+        "members": [(name, len(content)) for name, content in members.items()],
+        "sent": size,
+        "limits": (seconds, _CLOCK_PER_CPU * seconds, _TABLE_MEMORY + 4 * size),
+    }
+    answer = _reader.answer(request, *members.values()) if _has_interpreter() else _read_table(request, members)
+    if answer is None or "refused" in answer:
+        unreadable = (
+            "is damaged or incomplete, or takes too much memory or time to read; save it again, or give a smaller file."
+        )
+        raise InputError(f"{path} {(answer or {}).get('refused') or unreadable}")
+    return answer
+
+
+def _read_table(request: dict[str, Any], members: Mapping[str, bytes]) -> dict[str, Any] | None:
+    """The answer to a request of `read_apart`: what was read, or why it is refused."""
+    try:
+        return importlib.import_module(request["module"]).read(members, **request["options"])
+    except InputError as error:
+        return {"refused": str(error)}
+    except MemoryError:
+        return None
+    except Exception:  # a single wrong byte surfaces as almost any exception of these libraries
+        return {"refused": ""}
 
 
 def start() -> None:
@@ -120,16 +170,16 @@ class _Reader:
                 with contextlib.suppress(OSError):  # what was not sent
                     pipe.close()
 
-    def answer(self, request: dict[str, Any], content: Any) -> str | None:
-        """Empty where a file can be read, else why not; None where it is damaged."""
+    def answer(self, request: dict[str, Any], *contents: Any) -> Any:
+        """What was read, empty where that is nothing; a sentence why it cannot be; None where the file is damaged."""
         with self.lock:
             try:
-                return self._ask(request, content)
+                return self._ask(request, contents)
             except BaseException:  # the answer to a request that was interrupted must not be taken for the next one's
                 self.stop()
                 raise
 
-    def _ask(self, request: dict[str, Any], content: Any) -> str | None:
+    def _ask(self, request: dict[str, Any], contents: Sequence[Any]) -> Any:
         path = request["path"]
         try:
             self.start()
@@ -138,17 +188,18 @@ class _Reader:
         except (OSError, TypeError, ValueError) as error:  # an interpreter that is not there, has no name, or fails
             reason = (getattr(error, "strerror", None) or str(error)).lower()
             raise InputError(
-                f"{path} cannot be read, because the process that checks HDF5 files before they are opened does not "
-                f"start ({reason}); check whether {sys.executable} -c 'import h5py' works."
+                f"{path} cannot be read, because the process that reads files before they are opened does not start "
+                f"({reason}); check whether {sys.executable} -c 'import h5py' works."
             ) from error
         self._started, answer = True, b""
         with contextlib.suppress(OSError):  # it has ended
             self._process.stdin.write(json.dumps(request).encode() + b"\n")
-            self._process.stdin.write(content)
+            for content in contents:
+                self._process.stdin.write(content)
             self._process.stdin.flush()
             answer = self._process.stdout.readline()
-        if answer == b'""\n':
-            return ""
+        if answer.endswith(b"\n") and (answer == b'""\n' or answer[:1] == b"{"):
+            return json.loads(answer)
         status = None if answer.endswith(b"\n") else self._process.wait()
         self.stop()  # it ends
         if status is None:
@@ -186,12 +237,10 @@ def serve() -> None:
     os.dup2(2, 1)  # what a library prints is no answer
     from .hdf5_content import check
 
-    used = 0  # bytes of address space of this process on Linux; elsewhere memory is not limited
     with contextlib.suppress(OSError, ImportError):
         import resource
 
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     if hasattr(signal, "SIGPROF"):
         signal.signal(signal.SIGPROF, signal.SIG_DFL)  # ends the process; the parent may have had it ignored
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGPROF])
@@ -199,28 +248,39 @@ def serve() -> None:
     for line in sys.stdin.buffer:
         request = json.loads(line)
         content = sys.stdin.buffer.read(request["sent"])
-        answer: str | None = ""
-        try:
-            with _limited(used, *request["limits"]), contextlib.ExitStack() as stack:
-                source = content or stack.enter_context(open(request["opened"], "rb"))
-                check(request["path"], source, request["size"], request["largest"])
-        except InputError as error:
-            answer = str(error)
-        except Exception:  # a single wrong byte surfaces as almost any exception of HDF5, h5py and NumPy
-            answer = None
-        answers.write(json.dumps(answer).encode() + b"\n")
-        if answer != "":  # without memory, for one, HDF5 can no longer read what it could before
-            break
+        answer: Any = ""
+        if "module" in request:
+            importlib.import_module(request["module"])  # before memory is limited
+            members, end = {}, 0
+            for name, size in request["members"]:
+                members[name], end = content[end : end + size], end + size
+            with _limited(*request["limits"]):
+                answer = _read_table(request, members)
+        else:
+            try:
+                with _limited(*request["limits"]), contextlib.ExitStack() as stack:
+                    source = content or stack.enter_context(open(request["opened"], "rb"))
+                    check(request["path"], source, request["size"], request["largest"])
+            except InputError as error:
+                answer = str(error)
+            except Exception:  # a single wrong byte surfaces as almost any exception of HDF5, h5py and NumPy
+                answer = None
+        encoded = json.dumps(answer).encode() + b"\n"
+        while encoded:  # a pipe may take less at a time
+            encoded = encoded[answers.write(encoded) :]
+        if answer is None or (isinstance(answer, str) and answer):
+            break  # without memory, for one, HDF5 can no longer read what it could before
 
 
 @contextlib.contextmanager
-def _limited(used: int, cpu: float, clock: float, memory: int) -> Iterator[None]:
+def _limited(cpu: float, clock: float, memory: int) -> Iterator[None]:
     """While a file is read: so many seconds of CPU time and by the clock, and bytes of memory.
 
     On Linux all of them, on macOS those of time, on Windows that by the clock.
     """
     faulthandler.dump_traceback_later(clock, exit=True)
-    if used:
+    with contextlib.suppress(OSError, ImportError):
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
         import resource
 
         hard = resource.getrlimit(resource.RLIMIT_AS)[1]

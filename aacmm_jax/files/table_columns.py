@@ -12,7 +12,7 @@ from ..core.errors import InputError
 from ..core.text import csv_text, is_number, quoted
 from ..core.units import ANGLE_UNITS, DEG, LENGTH_UNITS
 from ..kinematics.arm import Arm, by_joint
-from .text_lines import Column, are_numbered, bare_name, stem_and_number
+from .text_lines import SI, Column, are_numbered, bare_name, stem_and_number
 from .text_table import TextTable
 
 # Words beside the number in the names of readings: q_1, joint 1, A1, axis_1, actual_q_0, /panda_joint1/position, ...
@@ -187,6 +187,7 @@ def header_units(text: TextTable, picked: Sequence[int], arm: Arm, stated: str |
     units = []
     for joints, columns, possible, stated_unit in kinds:
         unit = text.unit(columns, stated_unit)
+        unit = {"revolute": "rad", "prismatic": "m"}[joints] if unit == SI else unit
         if unit not in (None, "counts", *possible):
             raise InputError(
                 f"{text.path} has readings of {joints} joints in {quoted(unit)} (column "

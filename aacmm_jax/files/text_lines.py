@@ -95,9 +95,12 @@ _SPELT_OUT = {
     "gon": "gons gradian gradians", "arcsec": "as arcsecs arcsecond arcseconds",
     "counts": "count cts ticks inc increments pulses",
 }  # fmt: skip
-_UNITS = {name: name for name in (*ANGLE_UNITS, *LENGTH_UNITS, "counts", AMBIGUOUS)} | {
-    word: unit for unit, words in _SPELT_OUT.items() for word in words.split()
-}
+SI = "SI"  # rad of revolute joints and m of prismatic ones
+_UNITS = (
+    {name: name for name in (*ANGLE_UNITS, *LENGTH_UNITS, "counts", AMBIGUOUS)}
+    | {"si": SI}
+    | {word: unit for unit, words in _SPELT_OUT.items() for word in words.split()}
+)
 # Those that cannot be converted, or are of other quantities.
 _OTHERS = {*("cm", "dm", "nm", "ft", "feet", "mil", "arcmin", "urad", "mdeg", "rev", "turns", "s", "ms", "us", "h"),
            *("centimeter", "centimeters", "centimetre", "centimetres", "-", "%", "k", "\u00b0c", "degc", "n", "v", "a"),
@@ -105,7 +108,7 @@ _OTHERS = {*("cm", "dm", "nm", "ft", "feet", "mil", "arcmin", "urad", "mdeg", "r
 _IN_BRACKETS = re.compile(r"\s*(?:\[([^\]]*)\]|\(([^)\d]*)\))\s*$")
 _BRACKETED = re.compile(r"[\[(]([^\])]*)[\])]")
 # "_m" may mean anything, and so may each single letter, "in" and "as".
-_WORDS = {unit for unit in (*_UNITS, *_OTHERS) if len(unit) > 1 or unit == "\u00b0"} - {"in", "as"}
+_WORDS = {unit for unit in (*_UNITS, *_OTHERS) if len(unit) > 1 or unit == "\u00b0"} - {"in", "as", "si"}
 _LONGEST_FIRST = "|".join(map(re.escape, sorted(_WORDS, key=len, reverse=True)))  # rad/s before rad
 _WORD = re.compile(rf"(?:^|[_\s,.:/-]+)({_LONGEST_FIRST})(?=$|[_\s,.:/-])", re.IGNORECASE)
 _LAST_NUMBER = re.compile(r"(.*?)([0-9]+)([^0-9]*)", re.DOTALL)

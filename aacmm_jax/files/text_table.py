@@ -1,4 +1,4 @@
-"""Text tables: comma, semicolon, tab or blank between columns, header lines allowed."""
+"""Text tables: comma, semicolon, tab or blank between columns, header lines allowed; and tables of other formats."""
 
 import contextlib
 import itertools
@@ -10,6 +10,7 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..core.text import is_number, number, quoted, shorten
+from .table_sources.sources import lines_of_source
 from .text_lines import (
     AMBIGUOUS,
     Column,
@@ -44,6 +45,9 @@ class TextTable:
     ``delimiter`` and ``decimal`` are found where they are None; ``skip`` lines before the header are left out; of
     several lines of words, the header is the one that has the columns that are ``wanted``. Raises `InputError` where
     the file is no text, its rows differ in their number of columns, or several lines may be its header.
+
+    A file in a format of `table_sources` is read as the text that its table would be; ``tables`` and ``corners`` are
+    those of `lines_of_source`.
     """
 
     def __init__(
@@ -54,9 +58,22 @@ class TextTable:
         decimal: str | None = ".",
         skip: int = 0,
         wanted: Sequence[Column] = (),
+        tables: Sequence[str] = (),
+        corners: int = 0,
     ):
         self.path, self._hashes = path, False
-        lines, self._ended = table_lines(path)
+        source = lines_of_source(path, tables, corners)
+        self.note = "" if source is None else source.note  # what was read of it
+        self._is_text, self._place = source is None, "line" if source is None else "row"
+        if source is None:
+            lines, self._ended = table_lines(path)
+        elif delimiter or decimal == "," or (skip and source.header):
+            raise InputError(
+                f"{path} is not a text table, so delimiter, decimal and skip do not apply; remove these keys."
+            )
+        else:
+            lines, self._ended, delimiter, decimal = source.lines, True, "\t", "."
+        first = skip + (source is None or not source.header)
         if lines[skip : skip + 1] and (stated := re.fullmatch('"?sep=(.)"?', lines[skip])):  # of spreadsheets
             delimiter, skip = delimiter or stated[1], skip + 1
         delimiter = delimiter or delimiter_of(lines[skip:], decimal)
@@ -64,7 +81,7 @@ class TextTable:
         words: list[Line] = []
         comments: list[Line] = []
         rows: list[Line] = []
-        for line_number, line in enumerate(lines[skip:], start=skip + 1):
+        for line_number, line in enumerate(lines[skip:], start=first):
             cells = cells_of(line, delimiter)
             if not any(cell.strip(' \t"') for cell in cells):
                 continue
@@ -82,9 +99,9 @@ class TextTable:
         for line_number, cells in rows:
             if len(cells) != width:
                 raise InputError(
-                    f"{path} line {line_number} has {len(cells)} columns, but the lines before it have {width}; give "
-                    "all lines the same number of columns, or copy the file again if it is incomplete, or add skip = "
-                    f"{line_number - 1} if the table begins in that line."
+                    f"{path} {self._place} {line_number} has {len(cells)} columns, but those before it have {width}; "
+                    "give all lines the same number of columns, or copy the file again if it is incomplete, or add "
+                    f"skip = {line_number - 1} if the table begins in that line."
                 )
         self._lines, self._rows = [number for number, _ in rows], [cells for _, cells in rows]
         # Columns at the end that are empty in all rows and without a name: lines that end with delimiters.
@@ -241,7 +258,11 @@ class TextTable:
         return np.array([self._number(i, index, cell) for i, cell in enumerate(cells)])
 
     def _number(self, row: int, index: int, cell: str) -> float:
-        place = f"{self.path} line {self._lines[row]} column {index + 1}: {quoted(cell)}"
+        place = f"{self.path} {self._place} {self._lines[row]} column {index + 1}"
+        if not self._is_text and not is_number(cell):
+            what = f": {quoted(cell)} is not a number" if cell else " is empty"
+            raise InputError(f"{place}{what}; correct the cell, or delete the row.")
+        place += f": {quoted(cell)}"
         plain = cell.replace(self._decimal, ".")
         if not is_number(plain) or (self._decimal == "," and "." in cell):
             mark = 'add decimal = "," to its table' if self._decimal == "." else 'remove decimal = ","'

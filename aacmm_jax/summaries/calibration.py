@@ -99,6 +99,7 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
         "sockets": rows_of(socket=capture.names, poses=capture.sizes),
         "observations": capture_observations(capture),
         "images": image_rows(recording),
+        "notes": list(recording.notes),
         "lengths": reference_length_rows(capture.lengths, u_mm=[float(length.u) for length in capture.lengths]),
         "ranges": [
             {"joint": i, f"lowest_{unit}": low, f"highest_{unit}": high}

@@ -4,6 +4,10 @@ POINT = "Position in the base frame, mm."
 DESCRIPTIONS = {
     # Manifests
     "file": "Path of the file, relative to this file; for sockets and observations, it may have fields in braces.",
+    "table": "What is read in a file that is not a text table: variables, a sheet, topics, a feature.",
+    "readings_table": "The same as `table`, for the file of `readings`.",
+    "PixelsTable.corner_table": "The same as `table`, for the file of `corners`.",
+    "Angles.calibration": "LeRobot's calibration file, with which its counts, degrees or percent become angles.",
     "files": "Several files, instead of `file`; for an artefact also `{ point = file }`.",
     "exclude": "Shell patterns of files to leave out.",
     "session": "Session in which the data were recorded; the probe was remounted between sessions.",

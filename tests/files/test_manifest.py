@@ -271,7 +271,7 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         (SMALL.replace("a.csv", "folder"), ["folder is a folder", "give a file"]),
         (
             SMALL.replace("rad", "grad"),
-            ["'angles.unit' must be 'rad', 'deg', 'arcsec', 'gon', 'mrad' or 'counts', not 'grad'"],
+            ["'angles.unit' must be 'rad', 'deg', 'arcsec', 'gon', 'mrad', 'counts' or 'percent', not 'grad'"],
         ),
         (HEAD + SOCKET, ["'angles' is missing", "unit of the readings", "add [angles]"]),
         (HEAD + ANGLES, ["no [[socket]] and no other observation", "add at least one"]),

@@ -255,11 +255,11 @@ def test_units_that_contradict_the_manifest(tmp_path, header):
             if unit == "grad" and stated != "rad":
                 continue
             for angles, of_table in ((Angles(unit=stated), None), (None, stated)):
-                wanted = Wanted(None, of_table, None, [], None)
+                wanted = Wanted(None, of_table, None, [])
                 sentence = refusal(lambda file=file, angles=angles, wanted=wanted: Readings(arm, angles)(file, wanted))
                 assert {"ticks": "counts"}.get(unit, unit).casefold() in sentence, sentence
                 assert stated in sentence, sentence
-        nothing = Wanted(None, None, None, [], None)
+        nothing = Wanted(None, None, None, [])
         if unit in ANGLE_UNITS:
             np.testing.assert_allclose(Readings(arm, None)(file, nothing), ANGLE_UNITS[unit] * Q[:, :6])
         else:
