@@ -9,7 +9,7 @@ import numpy as np
 import typer
 
 from .. import files, kinematics, summaries
-from ..core.errors import InputError, naming
+from ..core.errors import InputError
 from ..core.text import printable, shorten
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import check_kept, together, write_text
@@ -193,10 +193,7 @@ def _zeros_in_file(record: Any, form: str, file: Path | None, motors: str | None
         written = files.ros_calibration(source, zeros)
     else:
         change = files.lerobot_calibration if form == "lerobot" else files.kuka_machine_data
-        with naming(file):
-            read = InputFile(file)
-            text = read.text and read.content.decode()  # with its own line ends
-            written = change(text, zeros, None if motors is None else names_option(motors))
+        written = change(InputFile(file), zeros, None if motors is None else names_option(motors))
     return written.text, [
         f"With these zero offsets, the tips of the nominal and the calibrated arm differ by {zeros.rms:.4f} mm RMS "
         f"({zeros.rms_nominal:.4f} mm without).",

@@ -11,22 +11,24 @@ ROS: ``<calibration rising=... falling=.../>`` of a URDF's joint: the positions 
 
 import json
 import math
+import os
 import re
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ..core.errors import InputError
 from ..core.text import number, quoted, shorten
 from ..core.units import DEG
 from ..kinematics.parameters import UrdfSource
 from .controllers import ZeroOffsets
+from .inputs import InputFile
+from .lerobot_motors import RESOLUTION, read_motors
 from .urdf import urdf_chain
 from .xml_text import replaced, with_values
 
-_TURN = 4096  # counts of the motors that LeRobot's arms have
-_FARTHEST = 2047  # counts: the largest homing offset that these motors store
+_FARTHEST = 2047  # counts: the largest homing offset that LeRobot's motors store
 _MAMES = re.compile(
-    r"^([ \t]*(?:REAL[ \t]+)?\$MAMES\[(\d{1,3})\][ \t]*=[ \t]*)([-+]?[\d.]+(?:[eE][-+]?\d+)?)", re.MULTILINE
+    r"^([ \t]*(?:REAL[ \t]+)?\$MAMES\[(\d{1,3})\][ \t]*=[ \t]*)([-+]?\d+\.?\d*(?:[eE][-+]?\d+)?)", re.MULTILINE
 )
 
 
@@ -37,82 +39,81 @@ class ZerosInFile(NamedTuple):
     notes: tuple[str, ...]  # what it means, in sentences
 
 
-def lerobot_calibration(text: str, zeros: ZeroOffsets, motors: Sequence[str] | None = None) -> ZerosInFile:
+def lerobot_calibration(
+    path: str | os.PathLike, zeros: ZeroOffsets, motors: Sequence[str] | None = None
+) -> ZerosInFile:
     """LeRobot's calibration file with the homing offsets that make readings those of the calibrated arm.
 
     Args:
-        text: The file.
+        path: The file.
         zeros: The offsets, from `zero_offsets`; rad.
         motors: The motor of each joint, with ``-`` before it where its readings count against those of the arm, or
             where the motor adds its offset (Dynamixel). By default those of the file in order, without ``gripper``.
 
     Example:
-        >>> file = '{"pan": {"id": 1, "drive_mode": 0, "homing_offset": 10, "range_min": 0, "range_max": 4095}}'
+        >>> from pathlib import Path
+        >>> text = '{"pan": {"id": 1, "drive_mode": 0, "homing_offset": 10, "range_min": 0, "range_max": 4095}}'
+        >>> _ = Path("motors.json").write_text(text)
         >>> zeros = aj.files.ZeroOffsets(np.array([0.01]), ("rad",), np.zeros(3), 1.0, 0.1, 0.2)
-        >>> print(json.loads(aj.files.lerobot_calibration(file, zeros).text)["pan"]["homing_offset"])
-        3
+        >>> print(aj.files.lerobot_calibration("motors.json", zeros).text.split(",")[2].strip())
+        "homing_offset": 3
     """
-    try:
-        content: Any = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"the file is not valid JSON ({error}); give the calibration file of LeRobot.") from error
-    motors_of_file = content.items() if isinstance(content, dict) else ()
-    offsets = {name: isinstance(motor, dict) and motor.get("homing_offset") for name, motor in motors_of_file}
-    wrong = [name for name, offset in offsets.items() if type(offset) is not int]
-    if not offsets or wrong:
-        raise InputError(
-            f"the file has no whole number as homing_offset{f' of motor {quoted(wrong[0])}' if wrong else ''}; give "
-            "the calibration file of LeRobot."
-        )
+    found = read_motors(InputFile(path))
     if "mm" in zeros.units:
         raise InputError("the arm has prismatic joints, whose zero offsets are not counts of a turn; use offsets.")
-    rounded = 0.0
-    chosen = _entries([name for name in offsets if name != "gripper"], list(offsets), motors, zeros, "motor")
+    rounded, content = 0.0, {name: motor.model_dump() for name, motor in found.items()}
+    chosen = _entries([name for name in found if name != "gripper"], list(found), motors, zeros, "motor")
     for (name, sign), offset in zip(chosen, zeros.offsets, strict=True):
-        exact = sign * offset * _TURN / (2 * math.pi)
-        content[name]["homing_offset"] = new = offsets[name] - round(exact)
-        rounded = max(rounded, abs(exact - round(exact)))
+        exact = sign * float(offset) * RESOLUTION / (2 * math.pi)
+        content[name]["homing_offset"] = new = found[name].homing_offset - round(exact)
+        rounded = max(rounded, abs(exact - round(exact)) * 360 / RESOLUTION)
         if abs(new) > _FARTHEST:
             raise InputError(
                 f"motor {quoted(name)} would have the homing offset {new}, beyond the {_FARTHEST} counts that it "
                 "stores; calibrate the motors nearer to the middle of their range first."
             )
-    return ZerosInFile(json.dumps(content, indent=4) + "\n", (
-        f"Homing offsets are whole counts of {360 / _TURN:.3f} deg; by rounding, readings are off by up to "
-        f"{rounded * 360 / _TURN:.3f} deg.",
+    notes = (
+        f"Homing offsets are whole counts of {360 / RESOLUTION:.3f} deg; by rounding, readings are off by up to "
+        f"{rounded:.3f} deg.",
         "The ranges stay, so that the middle of a range remains the zero of its motor.",
-    ))  # fmt: skip
+    )
+    return ZerosInFile(json.dumps(content, indent=4) + "\n", notes)
 
 
-def kuka_machine_data(text: str, zeros: ZeroOffsets, axes: Sequence[str] | None = None) -> ZerosInFile:
+def kuka_machine_data(path: str | os.PathLike, zeros: ZeroOffsets, axes: Sequence[str] | None = None) -> ZerosInFile:
     """KUKA's ``$machine.dat`` with other ``$MAMES``, which apply from the next mastering on.
 
     Args:
-        text: The file.
+        path: The file.
         zeros: The offsets, from `zero_offsets`; rad, or mm of prismatic joints.
         axes: The number of each joint's axis, with ``-`` before it where the axis counts against the joint; by default
             1, 2, ... in order.
 
     Example:
+        >>> from pathlib import Path
+        >>> _ = Path("machine.dat").write_text("$MAMES[1]=-20.0")
         >>> zeros = aj.files.ZeroOffsets(np.array([0.1]) * np.pi / 180, ("rad",), np.zeros(3), 1.0, 0.1, 0.2)
-        >>> print(aj.files.kuka_machine_data("$MAMES[1]=-20.0", zeros).text)
+        >>> print(aj.files.kuka_machine_data("machine.dat", zeros).text)
         $MAMES[1]=-19.9
     """
+    file = InputFile(path)
+    text = file.text and file.content.decode()  # with its own line ends
     known = [match[2] for match in _MAMES.finditer(text)]
     if not known:
-        raise InputError("the file has no line $MAMES[1]=..., as $machine.dat has for each axis; give this file.")
+        raise InputError(f"{path} has no line $MAMES[1]=..., as $machine.dat has for each axis; give this file.")
+    added: dict[str, float] = {}
     chosen = _entries(known, known, axes, zeros, "axis")
-    added = {}
     for (axis, sign), offset, unit in zip(chosen, zeros.offsets, zeros.units, strict=True):
         added[axis] = sign * float(offset) / (DEG if unit == "rad" else 1.0)
 
     def stated(match: re.Match[str]) -> str:
         return match[0] if match[2] not in added else f"{match[1]}{round(number(match[3]) + added[match[2]], 6)!r}"
 
-    return ZerosInFile(_MAMES.sub(stated, text), (
+    notes = (
         "$MAMES applies when an axis is mastered again; changing machine data wrongly can damage the robot, so keep "
         "the original file and try the axes slowly.",
-    ))  # fmt: skip
+    )
+    return ZerosInFile(_MAMES.sub(stated, text), notes)
 
 
 def ros_calibration(source: UrdfSource, zeros: ZeroOffsets) -> ZerosInFile:
@@ -159,6 +160,8 @@ def _entries(
     names = [name for name, _ in chosen]
     unknown = [name for name in names if name not in known]
     if unknown or len(names) != joints or len(set(names)) != joints:
-        said = f"no {what} {quoted(unknown[0])}" if unknown else f"{len(set(names))} entries for {joints} joints"
+        said = (
+            f"there is no {what} {quoted(unknown[0])}" if unknown else f"{joints} joints need as many different names"
+        )
         raise InputError(f"{said}; name one {what} per joint (--motors) of those in the file: {shorten(known, 12)}.")
     return chosen

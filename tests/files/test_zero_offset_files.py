@@ -28,13 +28,20 @@ def zeros(units=("rad",) * 6) -> aj.files.ZeroOffsets:
     return aj.files.ZeroOffsets(OFFSETS, units, np.zeros(3), 1.0, 0.1, 0.2)
 
 
+def written(folder: Path, text: str) -> Path:
+    path = folder / "file"
+    path.write_bytes(text.encode())
+    return path
+
+
 def degrees(motor: dict, encoder: int) -> float:
     """LeRobot's reading of a Feetech motor: 0 in the middle of the range, and 4096 counts a turn."""
     return (encoder - motor["homing_offset"] - (motor["range_min"] + motor["range_max"]) / 2) * 360 / 4096
 
 
-def test_lerobot_readings_change_by_the_offsets():
-    changed = aj.files.lerobot_calibration(json.dumps(MOTORS), zeros())
+def test_lerobot_readings_change_by_the_offsets(tmp_path):
+    path = written(tmp_path, json.dumps(MOTORS))
+    changed = aj.files.lerobot_calibration(path, zeros())
     motors = json.loads(changed.text)
     for offset, name in zip(OFFSETS, MOTORS, strict=False):
         change = degrees(motors[name], 2500) - degrees(MOTORS[name], 2500)
@@ -44,12 +51,12 @@ def test_lerobot_readings_change_by_the_offsets():
     assert "whole counts of 0.088 deg" in changed.notes[0]
     # Exact, where an offset is a whole number of counts; the other way round by a minus; in another order.
     exact = zeros()._replace(offsets=OFFSETS[:2] * 0 + 2 * np.pi / 4096 * np.array([5, 7]), units=("rad",) * 2)
-    motors = json.loads(aj.files.lerobot_calibration(json.dumps(MOTORS), exact, ["lift", "-pan"]).text)
+    motors = json.loads(aj.files.lerobot_calibration(path, exact, ["lift", "-pan"]).text)
     assert [motors[name]["homing_offset"] - MOTORS[name]["homing_offset"] for name in ("lift", "pan")] == [-5, 7]
 
 
-def test_kuka_axes_get_the_offsets_at_mastering():
-    changed = aj.files.kuka_machine_data(DATA, zeros(), ["-1", "2", "3", "4", "5", "6"])
+def test_kuka_axes_get_the_offsets_at_mastering(tmp_path):
+    changed = aj.files.kuka_machine_data(written(tmp_path, DATA), zeros(), ["-1", "2", "3", "4", "5", "6"])
     was, now = (
         [float(line.split("=")[1].split(";")[0]) for line in text.splitlines() if "$MAMES" in line]
         for text in (DATA, changed.text)
@@ -83,29 +90,28 @@ def test_ros_calibration_as_yourdfpy_reads_it(tmp_path):
     np.testing.assert_array_equal(again.arm.pose(OFFSETS), robot.arm.pose(OFFSETS))  # origins stay
 
 
+FAR = json.dumps({name: {**motor, "homing_offset": 2047} for name, motor in MOTORS.items()})
+
+
 @pytest.mark.parametrize(
-    ("change", "parts"),
+    ("change", "text", "more", "parts"),
     [
-        (lambda: aj.files.lerobot_calibration("{", zeros()), ["not valid JSON"]),
-        (lambda: aj.files.lerobot_calibration("[1]", zeros()), ["no whole number as homing_offset"]),
-        (lambda: aj.files.lerobot_calibration('{"a": {"homing_offset": 1.5}}', zeros()), ["of motor 'a'"]),
-        (lambda: aj.files.lerobot_calibration(json.dumps({"pan": MOTORS["pan"]}), zeros()), ["1 entries for 6 joints"]),
-        (lambda: aj.files.lerobot_calibration(json.dumps(MOTORS), zeros(), ["pan"] * 6), ["1 entries for 6"]),
-        (lambda: aj.files.lerobot_calibration(json.dumps(MOTORS), zeros(), ["x"]), ["no motor 'x'", "pan, lift"]),
-        (lambda: aj.files.lerobot_calibration(json.dumps(MOTORS), zeros(("mm",) * 6)), ["prismatic"]),
-        (lambda: aj.files.kuka_machine_data("$MAMES", zeros()), ["no line $MAMES[1]"]),
-        (lambda: aj.files.kuka_machine_data("$MAMES[1]=2\n", zeros()), ["1 entries for 6 joints", "--motors"]),
+        ("lerobot_calibration", "{", (zeros(),), ["not valid JSON"]),
+        ("lerobot_calibration", json.dumps({"pan": MOTORS["pan"]}), (zeros(),), ["6 joints need as many names"]),
+        ("lerobot_calibration", json.dumps(MOTORS), (zeros(), ["pan"] * 6), ["6 joints need as many names"]),
+        ("lerobot_calibration", json.dumps(MOTORS), (zeros(), ["x"]), ["no motor 'x'", "pan, lift"]),
+        ("lerobot_calibration", json.dumps(MOTORS), (zeros(("mm",) * 6),), ["prismatic"]),
+        ("lerobot_calibration", FAR, (zeros(),), ["beyond the 2047 counts"]),
+        ("kuka_machine_data", "$MAMES", (zeros(),), ["has no line $MAMES[1]"]),
+        ("kuka_machine_data", "$MAMES[1]=2\n", (zeros(),), ["6 joints need as many names", "--motors"]),
     ],
 )
-def test_refusals(change, parts):
-    assert_refused(change, *parts)
+def test_refusals(tmp_path, change, text, more, parts):
+    path = written(tmp_path, text)
+    assert_refused(lambda: getattr(aj.files, change)(path, *more), *parts)
 
 
-def test_a_homing_offset_that_motors_cannot_store_is_refused():
-    far = {name: {**motor, "homing_offset": 2047} for name, motor in MOTORS.items()}
-    assert_refused(lambda: aj.files.lerobot_calibration(json.dumps(far), zeros()), "beyond the 2047 counts")
-
-
+@pytest.mark.slow
 def test_export_by_the_command_line(tmp_path):
     sockets = ("--socket", "A=600,100,500", "--socket", "B=300,-200,600", "--length", "A,B,0.002")
     (tmp_path / "robot.urdf").write_text(FILE.read_text())
