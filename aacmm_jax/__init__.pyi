@@ -51,6 +51,7 @@ from .pipeline.hold_out import residuals_of as residuals_of
 from .pipeline.model_ladder import compare_models as compare_models
 from .pipeline.single import calibrate as calibrate
 from .pipeline.single import identify as identify
+from .pipeline.verification import verify as verify
 from .solver.bounded import least_squares as least_squares
 from .solver.reason import Reason as Reason
 from .uncertainty.identifiability import observability as observability

@@ -13,7 +13,7 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
 # A small version of what the long ones show is in the other tests. Those compute more than they compile.
-LONG = ("01", "03", "04", "05", "06", "07")
+LONG = ("01", "03", "04", "05", "06", "07", "08")
 MARKS = {True: (pytest.mark.exhaustive, pytest.mark.optimised), False: pytest.mark.slow}
 
 
@@ -34,7 +34,7 @@ def test_notebook_runs(path):
 
 
 def test_all_are_there_with_their_outputs():
-    assert [path.stem[:2] for path in NOTEBOOKS] == ["01", "02", "03", "04", "05", "06", "07"]
+    assert [path.stem[:2] for path in NOTEBOOKS] == ["01", "02", "03", "04", "05", "06", "07", "08"]
     for path in NOTEBOOKS:
         assert '"image/png"' in path.read_text()
 

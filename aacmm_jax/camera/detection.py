@@ -13,13 +13,16 @@ from jaxtyping import Float, Int
 
 from ..core.arguments import checked_arguments
 from ..core.errors import InputError, require
+from ..core.pictures import picture_size
 from ..core.text import pluralise
 from ..data.targets import DICTIONARIES, AbstractTarget, Charuco, Checkerboard
+from .consistency import on_one_line
 from .edges import blur_of
-from .evidence import BORDER, FEWEST, Grey, Refusal, inside, points_of, why_nothing
+from .evidence import BORDER, FEWEST, Grey, Refusal, inside, why_nothing
 from .markers import tag_corners, target_markers
 from .squares import charuco_corners, checkerboard_corners
 
+_MOST_PIXELS = 120_000_000  # of an image
 _BLURRED = 0.12  # the most blur, of the distance between neighbouring corners
 _WIDEST, _MOST_BLUR = 7.0, 3.0  # px: the width across edges in which blur is measured, and the most of it
 _PREVIEW = 320  # px: the larger side of a picture for a report
@@ -120,13 +123,17 @@ def read_image(image: str | os.PathLike | np.ndarray) -> Grey:
         if not os.path.isfile(image):
             raise InputError(f"{image} does not exist; give the path of an image.")
         content = Path(image).read_bytes()
-    data = np.frombuffer(content, dtype=np.uint8)
+    data, (width, height) = np.frombuffer(content, dtype=np.uint8), picture_size(content) or (0, 0)
+    readable = len(data) > 0 and width * height <= _MOST_PIXELS
     try:
-        grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
+        grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if readable else None
     except cv2.error:  # such as an image of billions of pixels
         grey = None
     if grey is None:
-        raise InputError(f"{image} is not an image that OpenCV reads; give a PNG or JPEG file.")
+        raise InputError(
+            f"{image} is not an image that OpenCV reads, is damaged, or has more than {_MOST_PIXELS // 10**6} million "
+            "px; give a PNG or JPEG file."
+        )
     return np.asarray(grey)
 
 
@@ -194,9 +201,7 @@ def _checked_blur(
     if len(ids) < FEWEST[target.kind]:
         fewest = f"at least {FEWEST[target.kind]} are needed"
         raise Refusal(f"{pluralise(len(ids), 'corner')} found, and {fewest}{why_nothing(grey)}")
-    points = points_of(target, ids)
-    sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    if sizes[1] < 0.05 * sizes[0]:
+    if on_one_line(target.points_of(ids)):
         raise Refusal(f"the {len(ids)} corners found are on one line")
     where, found = {corner: k for k, corner in enumerate(ids.tolist())}, []
     if isinstance(target, Checkerboard | Charuco):

@@ -50,29 +50,27 @@ def inside(grey: Grey, places: Float[np.ndarray, "k 2"], border: float) -> np.nd
     return np.all((places > border) & (places < np.array(grey.shape[::-1]) - 1 - border), axis=1)
 
 
-def points_of(target: AbstractTarget, ids: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k 3"]:
-    """Nominal coordinates of corners, mm."""
-    order = np.argsort(target.ids)
-    return target.nominal[1][order[np.searchsorted(target.ids[order], ids)]]
-
-
 def fitting(
-    target: AbstractTarget, ids: Int[np.ndarray, " k"], corners: Float[np.ndarray, "k 2"], spacing: float
+    target: AbstractTarget,
+    ids: Int[np.ndarray, " k"],
+    corners: Float[np.ndarray, "k 2"],
+    spacing: float,
+    size: tuple[int, ...],
 ) -> Bool[np.ndarray, " k"]:
     """Which corners are where the target has them; those beside what hides the target in part are not.
 
     Refuses the image where many are not, though their order is right.
     """
-    points, kept = points_of(target, ids), np.arange(len(ids))
+    points, kept = target.points_of(ids), np.arange(len(ids))
     while len(kept):
-        misfit = misfits(points[kept], corners[kept])
+        misfit = misfits(points[kept], corners[kept], size)
         worst = misfit.max()
         if worst <= max(_MOST_MEDIANS * float(np.median(misfit)), _LEAST_MISFIT):
             break
         kept = np.delete(kept, np.argmax(misfit))
     if len(kept) < (1 - _MOST_APART) * len(ids) or (len(kept) and worst > max(_MISFIT * spacing, 2 * _LEAST_MISFIT)):
         raise Refusal(
-            f"corners are {misfits(points, corners).max():.1f} px from where the target has them: the sizes stated are "
-            "not in the right ratio, it is hidden in part, or a board is not flat"
+            f"corners are {misfits(points, corners, size).max():.1f} px from where the target has them: the sizes "
+            "stated are not in the right ratio, it is hidden in part, or a board is not flat"
         )
     return np.isin(np.arange(len(ids)), kept)

@@ -36,7 +36,7 @@ def target_markers(grey: Grey, target: AbstractTarget) -> tuple[np.ndarray, np.n
     twice = [int(tag) for tag, count in zip(*np.unique(tags, return_counts=True), strict=True) if count > 1]
     if twice:
         raise Refusal(f"two boards or a reflection: {_named(twice)} seen twice")
-    tags, corners, left_out = _agreeing(target, tags, corners)
+    tags, corners, left_out = _agreeing(target, tags, corners, grey.shape[::-1])
     notes = [f"not on the target: {strangers}"] if strangers else []
     notes += [f"not used, since not where the target has it: {_named(left_out)}"] if left_out else []
     return tags, corners, "; ".join(notes)
@@ -58,7 +58,7 @@ def _decoded(grey: Grey, target: AbstractTarget) -> tuple[Int[np.ndarray, " t"],
 
 
 def _agreeing(
-    target: AbstractTarget, tags: Int[np.ndarray, " t"], corners: Float[np.ndarray, "t 4 2"]
+    target: AbstractTarget, tags: Int[np.ndarray, " t"], corners: Float[np.ndarray, "t 4 2"], size: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray, list[int]]:
     """Markers that are where the target has them, and the ids of those that are not: some background looks like one.
 
@@ -68,7 +68,7 @@ def _agreeing(
     kept = np.arange(len(tags))
     while True:
         limit = max(_FAR * float(np.median(_sides(corners[kept]))), _LEAST_FAR)
-        misfit = misfits(points[kept].reshape(-1, 3), corners[kept].reshape(-1, 2)).reshape(-1, 4).max(axis=1)
+        misfit = misfits(points[kept].reshape(-1, 3), corners[kept].reshape(-1, 2), size).reshape(-1, 4).max(axis=1)
         if misfit.max() <= limit:
             return tags[kept], corners[kept], np.delete(tags, kept).tolist()
         if len(kept) - 1 < (1 - _MOST_LEFT_OUT) * len(tags):
@@ -94,7 +94,7 @@ def tag_corners(
         )
     ids, corners = (4 * tags[large, None] + np.arange(4)).ravel(), corners[large]
     corners, spacing = corners.reshape(-1, 2), float(np.median(_sides(corners)))
-    kept = fitting(target, ids, corners, spacing)
+    kept = fitting(target, ids, corners, spacing, grey.shape[::-1])
     return ids[kept], corners[kept]
 
 

@@ -13,7 +13,7 @@ PAPERS = {  # width and height, mm
     "a4": (210.0, 297.0), "a3": (297.0, 420.0), "a2": (420.0, 594.0), "a1": (594.0, 841.0), "a0": (841.0, 1189.0),
     "letter": (215.9, 279.4), "tabloid": (279.4, 431.8),
 }  # fmt: skip
-_POINTS = 72 / 25.4  # of a PDF, in 1 mm
+MM = 72 / 25.4  # of a PDF, in 1 mm
 _EDGE = 5.0  # mm: what printers leave white
 _FOOT = 17.0  # mm below the board: the bar and two lines of text
 _BAR = (3.0, 150.0)  # mm: its thickness, and its greatest length, which callipers measure
@@ -55,8 +55,7 @@ def board_pdf(target: AbstractTarget, paper: str = "a4") -> bytes:
     foot, bar = corner[1] + board[1] + 3.0, bar_length(target)
     rectangles = [*black, np.array([corner[0], foot, corner[0] + bar, foot + _BAR[0]])]
     path = [
-        f"{left * _POINTS:.4f} {(height - lower) * _POINTS:.4f} {(right - left) * _POINTS:.4f} "
-        f"{(lower - upper) * _POINTS:.4f} re"
+        f"{left * MM:.4f} {(height - lower) * MM:.4f} {(right - left) * MM:.4f} {(lower - upper) * MM:.4f} re"
         for left, upper, right, lower in rectangles
     ]
     lines = [
@@ -65,11 +64,10 @@ def board_pdf(target: AbstractTarget, paper: str = "a4") -> bytes:
         f"bar = {{ nominal = {bar:g}, measured = ..., u = 0.05 }}",
     ]
     text = [
-        f"BT /F1 7 Tf {corner[0] * _POINTS:.2f} {(height - foot - _BAR[0] - 4.0 - 3.5 * number) * _POINTS:.2f} Td "
-        f"({line}) Tj ET"
+        f"BT /F1 7 Tf {corner[0] * MM:.2f} {(height - foot - _BAR[0] - 4.0 - 3.5 * number) * MM:.2f} Td ({line}) Tj ET"
         for number, line in enumerate(lines)
     ]
-    return _document("\n".join(["0 g", *path, "f", *text]), (width * _POINTS, height * _POINTS))
+    return pdf_document("\n".join(["0 g", *path, "f", *text]), (width * MM, height * MM))
 
 
 def _title(target: AbstractTarget) -> str:
@@ -110,7 +108,7 @@ def _fits(needed: np.ndarray, size: tuple[float, float]) -> tuple[float, float] 
     return (fitting[0][0], fitting[0][1]) if fitting else None
 
 
-def _document(content: str, size: tuple[float, float]) -> bytes:
+def pdf_document(content: str, size: tuple[float, float]) -> bytes:
     """A PDF of one page."""
     objects = [
         "<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",

@@ -19,6 +19,7 @@ from .drawing import Patch, patches_of
 
 _SAMPLES = 3  # in a row and in a column of each pixel
 _SPACING = 8  # px between nodes of the spline of directions: its error is below a thousandth of a pixel
+_MOST_PIXELS = 50_000_000
 _LATERAL = 24.0  # px: the scale of blotches of the background
 _Box = tuple[int, int, int, int]  # first column and row, and those after the last
 
@@ -88,6 +89,11 @@ def render(
         raise InputError(f"the camera model '{model}' makes no images; give 'pinhole' or 'fisheye'.")
     camera.check_count(len(intrinsics), f"the camera '{model}'")
     width, height = size
+    if width * height > _MOST_PIXELS:
+        raise InputError(
+            f"an image of {width} x {height} px has more than the {_MOST_PIXELS:,} px that are rendered; give a "
+            "smaller image_size."
+        )
     random = np.random.default_rng(seed)
     grey = (optics.black + optics.white) / 2
     light = gaussian_filter(random.standard_normal((height, width)), _LATERAL)

@@ -43,7 +43,7 @@ def checkerboard_corners(grey: Grey, board: Checkerboard) -> tuple[np.ndarray, n
         corners = corners[::-1]
     spacing = float(np.median(np.linalg.norm(np.diff(corners.reshape(*inner[::-1], 2), axis=1), axis=-1)))
     corners = _refined(grey, corners, np.full(len(corners), 0.35 * spacing))
-    kept = fitting(board, board.ids, corners, spacing)
+    kept = fitting(board, board.ids, corners, spacing, grey.shape[::-1])
     far = np.array([board.columns, board.rows]) - 0.5
     outline = projected(matrix, board.size * np.array([[-1.5, -1.5], [far[0], -1.5], far, [-1.5, far[1]]]))
     if _pattern(_without(grey, outline), inner) is not None:
@@ -119,7 +119,7 @@ def charuco_corners(
     kept &= np.linalg.norm(corners - start, axis=1) < np.maximum(0.5 * room, _MOST_MOVED)
     if kept.sum() >= FEWEST["charuco"]:
         spacing = board.size / free * float(np.median(room))
-        kept[kept] = fitting(board, ids[kept], corners[kept], spacing)
+        kept[kept] = fitting(board, ids[kept], corners[kept], spacing, grey.shape[::-1])
     return ids[kept], corners[kept]
 
 

@@ -22,6 +22,7 @@ _FAMILIES = (
     "study_commands",
     "plan_commands",
     "target_command",
+    "verify_command",
 )
 
 

@@ -146,11 +146,12 @@ def read_with_progress(manifest: Path, overlays: Path | None = None) -> Any:
     from ..files.manifest import read_manifest
 
     with progress_bar(transient=True) as bar:
+        return read_manifest(manifest, progress=tracked(bar), overlays=overlays)
 
-        def shown(items: Sequence[Any], what: str) -> Iterable[Any]:
-            return items if bar is None else bar.track(items, description=what)
 
-        return read_manifest(manifest, progress=shown, overlays=overlays)
+def tracked(bar: Any) -> Callable[[Sequence[Any], str], Iterable[Any]]:
+    """What yields items and shows on a bar how many are done, where there is one."""
+    return lambda items, what: items if bar is None else bar.track(items, description=what)
 
 
 def show_summary(summary: dict[str, Any], as_json: bool, view: Callable[[dict[str, Any]], Iterable]) -> None:

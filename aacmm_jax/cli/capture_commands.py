@@ -13,7 +13,7 @@ from ..core.units import DEG
 from ..files.inputs import ROBOT_FILES
 from ..files.outputs import together
 from . import options, views
-from .app import command, read_with_progress, show_summary, with_spinner
+from .app import command, progress_bar, read_with_progress, show_summary, tracked, with_spinner
 from .arm_command import checked_recording, reading_check
 from .options import argument, bad_option, flag, length_option, numbers_option, option, output, seed, sockets_option
 
@@ -39,7 +39,8 @@ def demo(
 @command(
     "aacmm simulate cheng2018-simulation -o capture.h5 --poses 70 \\\n"
     "  --socket A=400,200,300 --socket B=600,200,300 --length A,B,0.002 \\\n"
-    "  --encoder-arcsec 2 --seating-mm 0.005"
+    "  --encoder-arcsec 2 --seating-mm 0.005",
+    "aacmm simulate ur10e -o capture.h5 --kit camera-kit.toml --encoder-arcsec 20 --images rendered",
 )
 def simulate(
     arm: str = options.NOMINAL_ARM,
@@ -50,6 +51,15 @@ def simulate(
     kit: Path | None = option(
         "Also simulate the artefacts and instruments of this kit (as for aacmm plan --kit), where it states them.",
         "KIT.toml",
+    ),
+    images: Path | None = option(
+        "Also render the images that the cameras of the kit take, and write them to this folder with the joint "
+        "readings and a manifest for aacmm import.",
+        "FOLDER",
+    ),
+    blur_px: float | None = option("Blur of these images (standard deviation). Default: 0.8.", "PX", min=0),
+    grey_noise: float | None = option(
+        "Noise of these images (standard deviation, of 255 grey levels). Default: 2.", "LEVELS", min=0
     ),
     poses: list[str] | None = option(
         "Number of poses in each socket, or in the named socket; may be given several times. Default: 70.",
@@ -95,6 +105,9 @@ def simulate(
     """Make a capture with a simulated arm."""
     from ..pipeline.capture_simulation import simulate_capture
 
+    optics = {name: x for name, x in (("blur", blur_px), ("noise", grey_noise)) if x is not None}
+    if images is None and optics:
+        raise InputError("--blur-px and --grey-noise apply to images only; give --images FOLDER too.")
     with together(output):
         nominal, true = files.load_specification(arm, base=base, tip=tip), None
         if true_arm:
@@ -111,7 +124,7 @@ def simulate(
             resolution_arcsec=(resolution_arcsec, linear_resolution_mm),
             temperature=None if warmth is None else warmth[0] if len(warmth) == 1 else list(warmth),
             acceptance=acceptance,
-            observations=[] if kit is None else [item.simulated for item in files.read_kit(kit)],
+            observations=[] if kit is None else _simulated(kit, images is not None),
             seed=seed,
         )
         chosen = chosen._replace(poses=_poses_option(poses, points, chosen.poses)) if poses else chosen
@@ -119,9 +132,32 @@ def simulate(
         if temperature_c is not None:
             nominal = files.load_specification(arm, base=base, tip=tip, capture=recording.capture)
         recording = recording._replace(nominal=nominal, usual=files.usual_noise(arm, base=base, tip=tip))
+        if images is not None:
+            recording = _with_images(images, recording, kit, arm, optics)
         summary = summaries.calibration.capture_summary(recording)
         files.save_capture(output, recording, summary)
-    show_summary(summary | {"written": str(output)}, as_json, views.capture)
+    written = str(output) if images is None else f"{output}, {images}"
+    show_summary(summary | {"written": written}, as_json, views.capture)
+
+
+def _simulated(kit: Path, true_views: bool) -> list[Any]:
+    """What a kit simulates; its cameras with the true views, by which images are rendered."""
+    items = [item.simulated for item in files.read_kit(kit)]
+    return [item.changed(true_views=true_views) if item.table == "pixels" else item for item in items]
+
+
+def _with_images(folder: Path, recording: Any, kit: Path | None, arm: str, optics: dict[str, float]) -> Any:
+    """Render images into a folder; the recording without what only a simulation knows."""
+    from ..camera.rendering import Optics
+    from ..files.rendered_images import MANIFEST, save_images
+    from .plan_commands import arm_for
+
+    if kit is None:
+        raise InputError("--images needs a kit with a camera; give --kit FILE.")
+    urdf = recording.nominal.urdf if arm.lower().endswith(".urdf") else None
+    entries = {"arm": arm_for(folder / MANIFEST, arm)} | ({} if urdf is None else {"base": urdf.base, "tip": urdf.tip})
+    with progress_bar(transient=True) as bar:
+        return save_images(folder, recording, kit, entries, Optics(**optics), progress=tracked(bar))
 
 
 def _poses_option(texts: Sequence[str], sockets: dict[str, Any], usual: Any) -> dict[str, Any]:

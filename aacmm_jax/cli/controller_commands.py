@@ -213,25 +213,20 @@ def _of_camera(record: Any, form: str, named: str | None, frame: str) -> str:
         if not rows:
             raise InputError(f"the calibration has no camera; choose another format than {form}.")
         raise InputError(f"choose one camera with --camera: {known}.")
-    row, nominal = chosen[0], record.recording.nominal
+    row = chosen[0]
     if form == "camera-info":
         values = np.array([number["value"] for number in row["intrinsics"]])
         size = row["image_size_px"] and (int(row["image_size_px"][0]), int(row["image_size_px"][1]))
         return camera_files.camera_info_yaml(row["camera"], camera_files.StoredCamera(row["model"], values, size))
-    part, parent = row[frame], "flange" if frame == "mount" else "base"
-    matrix = np.array(part["matrix_mm"])
-    if nominal.urdf is not None and frame == "mount":
-        parent = nominal.urdf.tip
-        matrix[:3, 3] -= np.asarray(nominal.arm.probe)  # the last frame is turned as the tip link
-    elif nominal.urdf is not None:
-        parent, matrix = nominal.urdf.base, first_frame(nominal) @ matrix
+    part = row[frame]
+    parent = "flange" if part["in"] == "last frame" else part["in"]
     write = {
         "joint-origin": camera_files.joint_origin,
         "static-transform": camera_files.static_transform,
         "opencv": camera_files.transform_storage,
         "matrix": camera_files.matrix_text,
     }
-    return write[form](parent, part["of"], matrix)
+    return write[form](parent, part["of"], np.array(part["matrix_mm"]))
 
 
 def _left_out_of_table(record: Any, arm: Any) -> list[str]:
@@ -412,7 +407,7 @@ def _at_temperature(commanded: Any, calibrated: Any, temperature: float | None) 
     from ..files.table_columns import TEMPERATURE
     from ..kinematics.arm import correction_names
     from ..kinematics.corrected_arm import loads_of
-    from ..kinematics.correction_kinds import Expansion
+    from ..kinematics.recorded_kinds import Expansion
 
     torques = calibrated.corrections is not None and "torques" in calibrated.corrections.functions.columns
     if torques and loads_of(calibrated) is None:

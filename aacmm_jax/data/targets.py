@@ -96,6 +96,11 @@ class AbstractTarget:
         """Where the corners are on the target, mm, with its scale."""
         return self.scale * self.nominal[1]
 
+    def points_of(self, ids: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k 3"]:
+        """Nominal coordinates of some corners, mm."""
+        order = np.argsort(self.ids)
+        return self.nominal[1][order[np.searchsorted(self.ids[order], ids)]]
+
     @property
     def is_planar(self) -> bool:
         """Whether all corners are in one plane."""

@@ -82,7 +82,7 @@ def _scatter(camera: Pixels, part: ObservationRows) -> Finding | None:
     if count < _FEWEST:
         return None
     ratio = float(np.sqrt(np.sum(np.asarray(part.white)[-1] ** 2) / count))
-    if _SCATTER[0] < ratio < _SCATTER[1]:
+    if _SCATTER[0] < ratio < _SCATTER[1] or not np.isfinite(ratio):
         return None
     stated, unit = float(np.mean(np.asarray(camera.u)[camera.seen])), camera.camera_model.unit
     more = ratio > 1

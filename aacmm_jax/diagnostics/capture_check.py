@@ -9,6 +9,7 @@ from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.observations.measured import MeasuredPoints
 from ..kinematics.arm import Arm
+from .camera_points import with_points_of_cameras
 from .reading_check import EXPLAINED, NEVER, ReadingCheck, checked_fit, reading_fit
 from .reading_fit import ReadingFit
 from .reading_search import Hypothesis
@@ -18,8 +19,8 @@ _LESS = 0.8  # of the residual: what each of several couplings must leave at mos
 
 
 def check_capture(arm: Arm, capture: Capture) -> ReadingCheck:
-    """`check_readings` of what was recorded in sockets, or as one station of an instrument saw it; where no order,
-    signs and zeros explain it, couplings of joints are tried."""
+    """`check_readings` of what was recorded in sockets, or as one station of an instrument or a camera saw it; where no
+    order, signs and zeros explain it, couplings of joints are tried."""
     check = checked_fit(reading_fit(arm, **_evidence_of(arm, capture)))
     return check if check.explained else check._replace(couplings=search_couplings(arm, capture))
 
@@ -39,11 +40,12 @@ def _evidence_of(arm: Arm, capture: Capture) -> dict[str, Any]:
     """The arguments of `check_readings` for a capture."""
     if any(size > 1 for size in capture.sizes):
         return {"q": np.asarray(capture.q)[:, : arm.joints], "sockets": capture.owner}
-    measured = [observation for observation in capture.observations if isinstance(observation, MeasuredPoints)]
+    parts = with_points_of_cameras(capture).observations
+    measured = [observation for observation in parts if isinstance(observation, MeasuredPoints)]
     if not measured:
         raise InputError(
-            "readings are checked against at least two poses in one socket, or against measured points; the "
-            "capture has neither."
+            "readings are checked against at least two poses in one socket, measured points, or images of a camera; "
+            "the capture has none of these."
         )
     station, target = measured[0].station, measured[0].target
     seen = [part for part in measured if (part.station, part.target) == (station, target)]

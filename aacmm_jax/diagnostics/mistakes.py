@@ -15,8 +15,11 @@ from ..core.text import shorten
 from ..core.units import DEG
 from ..data.capture import Capture, draw_poses
 from ..data.observations.held import position_of
+from ..data.observations.pixels import Pixels
 from ..kinematics.arm import is_length, value_of
 from ..kinematics.parameters import ArmSpecification
+from ..kinematics.workspace import total_link_length
+from .camera_points import with_points_of_cameras
 from .capture_check import check_capture
 from .corrections import UNITS, Mistake, likely_cause
 from .equations import PROBE
@@ -29,27 +32,28 @@ TRY_ALL = "aacmm arm ARM --check MANIFEST tries every order and sign of the colu
 _CHECKED = 150  # poses, drawn at random: more only take longer
 _BETTER = 2.0  # the factor by which other readings must reduce the residual to be believed
 _MAINLY = 3.0  # the factor by which the offset of the tip must exceed changes of other lengths to be the cause
+_FAR_OFF = 0.01  # of the arm's size: what is left of images that are not those of the poses
 _CLOSE = 0.02  # of a length: what the parameters of a real arm can change it by
 
 
 @by_equations
 def fitted_roughly(case: Case) -> RoughFit | None:
     """The robust fit of the capture of a calibration."""
-    return rough_fit(case.record.recording.nominal, case.record.recording.capture)
+    return rough_fit(case.record.recording.nominal, with_points_of_cameras(case.record.recording.capture))
 
 
 @by_equations
 def misplaced(case: Case) -> list[Misplaced]:
     """The poses that are wrong where most others agree with an arm."""
     fit = case.once(fitted_roughly)
-    return [] if fit is None else misplaced_poses(fit, case.record.recording.capture)
+    return [] if fit is None else misplaced_poses(fit, with_points_of_cameras(case.record.recording.capture))
 
 
 @by_equations
 def single_mistake(case: Case) -> Mistake | None:
     """The one mistake that explains why data do not match the arm, where it is found without a long search."""
     record, fit, wrong = case.record, case.once(fitted_roughly), case.once(misplaced)
-    nominal, capture = record.recording.nominal, record.recording.capture
+    nominal, capture = record.recording.nominal, with_points_of_cameras(record.recording.capture)
     if fit is None:
         # An offset that somebody stated is right; the zero is then wrong in the arm.
         return likely_cause(nominal.arm, capture, nominal.space().names if "offset" in record.recording.stated else ())
@@ -77,6 +81,13 @@ def _of_check(case: Case) -> Mistake | None:
     if check.couplings:
         return Mistake(f"Likely cause: {coupling_words(check.couplings)}. {TRY_ALL}", of_readings=True)
     given, best = check.given.rms_fitted, check.best.rms_fitted
+    record = case.record.recording
+    cameras = shorten([part.name for part in record.capture.observations if isinstance(part, Pixels)], 3)
+    if cameras and not check.explained and given > _FAR_OFF * total_link_length(record.nominal.arm):
+        return Mistake(
+            f"Likely cause: the images of {cameras} do not belong to the rows of the readings, are of several cameras, "
+            "or the camera or target moved: no order, signs and zeros of the joints explain what was seen."
+        )
     if not check.explained or check.best == check.given or best * _BETTER > given:
         return None
     return Mistake(f"Likely cause: {explanation_words(check.best)}. {TRY_ALL}", of_readings=True)

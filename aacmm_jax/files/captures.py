@@ -26,6 +26,7 @@ from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, un
 from .records import Field, attribute_name, record_in, row_values, rows_in, rows_table, table_of, values_in
 from .schema import ARM, IMAGES, LENGTHS, RECORDING, SPHERES, USUAL_NOISE
 from .stored_checks import read_checked
+from .urdf import located, urdf_chain
 
 _OBSERVATION = "observation_"
 _BESIDE = {  # the variables of what was recorded beside the joints' readings
@@ -159,7 +160,9 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     table = stored.tables.get("urdf")
     if table is not None:
         text = "".join(map(str, table["text"]))
-        nominal = nominal._replace(urdf=UrdfSource(text, table.attributes["base"], table.attributes["tip"]))
+        source = UrdfSource(text, table.attributes["base"], table.attributes["tip"])
+        with naming(path):
+            nominal = nominal._replace(urdf=located(source, urdf_chain(source), nominal.arm))
     return Recording(
         capture,
         nominal,

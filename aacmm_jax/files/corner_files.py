@@ -28,7 +28,7 @@ _LISTS = {
     "corners": ("corners", "image_points", "imgpoints", "points_2d"),
     "ids": ("ids", "point_ids", "charuco_ids"),
     "points": ("object_points", "objpoints", "points_3d"),
-    "images": ("images", "names", "files"),
+    "images": ("images", "names", "files", "image", "name", "file"),
 }
 NO_CORNERS = (np.zeros(0, dtype=int), np.zeros((0, 2)))
 _SAME = 1e-3  # of the size of the target, between an object point and the point of the target that it is
@@ -84,6 +84,8 @@ def corners_of_json(file: InputFile, target: AbstractTarget, dimensions: int) ->
         content: Any = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{file} is not valid JSON ({error}); correct the file.") from error
+    if isinstance(content, list) and content and all(isinstance(record, dict) for record in content):
+        content = {key: [record.get(key) for record in content] for key in content[0]}  # a record for each image
     content = (
         {str(key).lower(): value for key, value in content.items()}
         if isinstance(content, dict)
@@ -121,11 +123,11 @@ def _nested(file: InputFile, label: str, value: Any, width: int) -> Float[np.nda
         numbers = np.array(value, dtype=float)
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"{file} image {quoted(label)} has lists of different lengths, or texts; correct it."
+            f"{file} image {quoted(label)} has corners or points that are not {width} numbers each; correct it."
         ) from error
     if numbers.size % width or not np.all(np.isfinite(numbers)):
         raise InputError(
-            f"{file} image {quoted(label)} has corners that are not {width} finite numbers each; correct it."
+            f"{file} image {quoted(label)} has corners or points that are not {width} finite numbers each; correct it."
         )
     return numbers.reshape(-1, width)
 

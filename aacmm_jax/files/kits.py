@@ -12,6 +12,7 @@ from ..core.units import DEG
 from ..data.observations.declared import FREE
 from ..data.observations.simulated import AbstractSimulated, simulated_kinds
 from ..data.observations.simulated_pixels import SimulatedPixels
+from ..data.targets import AbstractTarget
 from ..planning.kit_placement import KitItem
 from .inputs import InputFile
 from .manifest_cameras import CameraTable, TargetTable
@@ -58,6 +59,7 @@ class KitPixels(Strict):
     distance: Annotated[list[PositiveFloat], Field(min_length=2, max_length=2)]  # least and largest, mm
     tilt_deg: Annotated[float, Field(gt=0, lt=90)] = 50.0  # largest, of the target's normal and the line of sight
     u: PositiveFloat = 0.3  # px: standard deviation of a coordinate of a corner
+    poses: PositiveInt = _POSES
 
 
 _KINDS = {table: kind for table, kind in simulated_kinds().items() if kind is not SimulatedPixels}
@@ -121,7 +123,7 @@ def read_kit(path: str | os.PathLike) -> list[KitItem]:
                 transforms[:, :3, 3] = tips
                 simulated.recorded(np.zeros((len(tips), 1)), transforms, np.random.default_rng(0))
             items.append(KitItem(simulated, places, turned, half_angle, tuple(normal)))
-    cameras = Cameras(Source(InputFile(path), "q"), content.camera, content.target)
+    cameras = _cameras(path, content)
     for entry in content.pixels:
         with naming(f"{path}: [[pixels]] '{entry.name}'"):
             items.append(KitItem(_pixels(entry, cameras), places=0))
@@ -142,7 +144,7 @@ def _pixels(entry: KitPixels, cameras: Cameras) -> SimulatedPixels:
     values = np.asarray(camera.intrinsics, dtype=float)
     u = np.full(len(values), FREE) if camera.u is None else np.broadcast_to(camera.u, values.shape)
     return SimulatedPixels(
-        entry.name, _POSES, entry.camera, entry.target, target.points, values, camera.image_size,
+        entry.name, entry.poses, entry.camera, entry.target, target.points, values, camera.image_size,
         on_arm=entry.on_arm == "camera", model=camera.model, u_intrinsics=u, mount=entry.mount, frame=entry.frame,
         distance=entry.distance, tilt=entry.tilt_deg * DEG, u=entry.u, u_scale=target.u_scale,
     )  # fmt: skip
@@ -151,3 +153,15 @@ def _pixels(entry: KitPixels, cameras: Cameras) -> SimulatedPixels:
 def target_tables(path: str | os.PathLike) -> list[dict[str, Any]]:
     """The ``[[target]]`` of a kit, as they are stated."""
     return [table.model_dump(exclude_unset=True) for table in read_toml(path, _Kit).target]
+
+
+def kit_targets(path: str | os.PathLike) -> dict[str, AbstractTarget]:
+    """The targets of a kit, by name."""
+    content = read_toml(path, _Kit)
+    cameras = _cameras(path, content)
+    return {table.name: cameras.target(table.name) for table in content.target}
+
+
+def _cameras(path: str | os.PathLike, content: Any) -> Cameras:
+    """The cameras and targets of a kit, whose files are relative to it."""
+    return Cameras(Source(InputFile(path), "q"), content.camera, content.target)

@@ -30,6 +30,7 @@ from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
 from .reading_sets import other_readings
 from .toml import read_toml
+from .urdf import joint_names
 
 _QUIETLY = Detecting()
 
@@ -87,7 +88,8 @@ def _read(path: str | os.PathLike, detecting: Detecting = _QUIETLY) -> tuple[Rec
         angles = model.angles
         if angles is not None and angles.calibration is not None:
             angles = angles_by_motors(angles, source.open(angles.calibration), nominal.arm.joints)
-        source.rows = readings = Readings(nominal.arm, angles)
+        names = () if nominal.urdf is None else joint_names(nominal.urdf)
+        source.rows = readings = Readings(nominal.arm, angles, names)
         sockets, lengths, spheres = _read_recorded(model, source)
         observed: list[tuple[str, Any]] = [(seat.session, seat) for seat in sockets.values() if not seat.target]
         # Where another tip than the arm's own probe was held, it is an observation.

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..camera.consistency import is_mirrored, misfits, on_one_line
 from ..core.errors import InputError, naming, nearest
 from ..core.text import quoted, shorten
 from ..core.units import LENGTH_UNITS
@@ -27,6 +28,7 @@ from .manifest_rows import Source, parts
 from .outputs import write_atomically
 from .patterns import fill
 
+_MISREAD = 0.05  # of the distance between corners, from where the target has them
 _FEWEST = 4  # corners of an image that determine the pose of a board
 Progress = Callable[[Sequence[Any], str], Iterable[Any]]  # shows how many of the items are done
 
@@ -174,8 +176,11 @@ def observations_of(
             used = [i for i, image in enumerate(images) if not image.refused]
             _check_once(q, images, used)
             if not used:
-                reasons = list(dict.fromkeys(f"{quoted(image.label)}: {image.refused}" for image in images))
-                raise InputError(f"no image can be used: {shorten(reasons, 3)}.")
+                labels: dict[str, list[str]] = {}
+                for image in images:
+                    labels.setdefault(image.refused, []).append(quoted(image.label))
+                reasons = [f"{shorten(of_reason, 1)}: {reason}" for reason, of_reason in labels.items()]
+                raise InputError(f"no image can be used ({shorten(reasons, 3)}); take other images, or correct these.")
             observed.append((part.session, _pixels(name, entry, camera, target, q[used], [images[i] for i in used])))
     named_images = {image.image for image in read}
     others = [image for image in seen if image.label not in named_images]
@@ -218,7 +223,11 @@ def _detected(
         raise InputError(f"no image matches '{pattern}' in {source.folder}; check the path.")
     seen = []
     for name in detecting.progress(names, "Detecting corners"):
-        image = read_image(source.open(name))
+        try:
+            image = read_image(source.open(name))
+        except InputError as error:  # one of many
+            seen.append(Seen(name, *NO_CORNERS, str(error).rpartition(f"{name} ")[2].partition(";")[0]))
+            continue
         found = detect(image, target, image_size=size)
         if detecting.overlays is not None:
             detecting.overlays.mkdir(parents=True, exist_ok=True)
@@ -245,9 +254,35 @@ def _checked(image: Seen, camera: Camera, target: AbstractTarget) -> Seen:
             f"{label} has the point id {ids[counts.argmax()]} twice; give one row for each corner, and one image for "
             "each pose."
         )
-    if not image.refused and len(ids) < _FEWEST:
-        return image._replace(refused=f"only {len(ids)} corners were found; at least {_FEWEST} are needed")
-    return image
+    return image._replace(refused=image.refused or _why_useless(image, camera, target))
+
+
+def _why_useless(image: Seen, camera: Camera, target: AbstractTarget) -> str:
+    """Why the corners of an image show no view of a target; empty where they do."""
+    if len(image.ids) < _FEWEST:
+        return f"only {len(image.ids)} corners were found; at least {_FEWEST} are needed"
+    points = target.points_of(image.ids)
+    if on_one_line(points):
+        return f"its {len(points)} corners are on one line"
+    if _is_misread(image, camera, points):
+        return (
+            "its corners are not where the target has them: it is another target, its rows and columns are exchanged, "
+            "or the ids are in another order"
+        )
+    if target.kind != "points" and image.corners.shape[1] == 2 and is_mirrored(points[:, :2], image.corners):
+        return "the board is seen from behind: the image is mirrored, or the ids are counted in another order"
+    return ""
+
+
+def _is_misread(image: Seen, camera: Camera, points: Float[np.ndarray, "k 3"]) -> bool:
+    """Whether corners that somebody detected cannot be those of these points; those detected here were checked."""
+    if image.size is not None or image.corners.shape[1] != 2:
+        return False
+    corners = image.corners
+    size = corners.max(axis=0) + 1 if camera.image_size is None else np.asarray(camera.image_size)
+    apart = np.linalg.norm(corners[:, None] - corners, axis=2) + np.diag(np.full(len(corners), np.inf))
+    misfit = np.median(misfits(points, corners, tuple(size.tolist())))
+    return bool(misfit > _MISREAD * np.median(apart.min(axis=1)))
 
 
 def _check_once(q: Float[np.ndarray, "m n"], images: Sequence[Seen], used: Sequence[int]) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..core.pictures import picture_size
 from .hdf5 import Entries, Stored, StoredTable, check_sense, is_moment, read_tables, undamaged
 from .records import check_fields
 from .schema import RECORDING, TABLES
@@ -59,13 +60,8 @@ def _is_preview(text: str) -> bool:
         content = base64.b64decode(text, validate=True)
     except ValueError:
         return False
-    at = 2
-    while content[:2] == b"\xff\xd8" and len(content) >= at + 9:
-        marker, length = content[at : at + 2], int.from_bytes(content[at + 2 : at + 4])
-        if marker in (b"\xff\xc0", b"\xff\xc2"):  # which begin the header of the picture
-            return max(int.from_bytes(content[i : i + 2]) for i in (at + 5, at + 7)) <= _LARGEST_PICTURE
-        at += 2 + length
-    return not content
+    size = picture_size(content) if content[:2] == b"\xff\xd8" else None
+    return not content or (size is not None and max(size) <= _LARGEST_PICTURE)
 
 
 def check_shown(path: str | os.PathLike, kind: str, summary: Mapping[str, Any]) -> None:

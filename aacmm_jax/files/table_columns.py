@@ -84,9 +84,11 @@ def reading_columns(
     *,
     line: str = LINE,
     required: bool = True,
+    names: Sequence[str] = (),
 ) -> list[int]:
-    """The columns of the joint readings, from 0: those ``stated``, else those with names of joints, or all that are not
-    ``taken`` where these are as many as the joints, and nothing in the header contradicts it.
+    """The columns of the joint readings, from 0: those ``stated``, else those with the ``names`` that the arm's file
+    gives its joints, or with usual names of joints, or all that are not ``taken`` where these are as many as the
+    joints, and nothing in the header contradicts it.
 
     ``line`` is what states columns, for messages. Raises `InputError` with the line to add where several sets of
     columns have such names, their numbers do not ascend, or they are ``required`` and not clear.
@@ -104,6 +106,11 @@ def reading_columns(
     def stated_by(columns: Sequence[int]) -> str:
         return line.format(", ".join(str(i + 1) for i in columns))
 
+    titles = [bare_name(title) for title in table.header]
+    if len(names) == joints and all(titles.count(name) == 1 for name in names):
+        picked = [titles.index(name) for name in names]
+        _check_not_taken(table, picked, taken)
+        return picked
     families = _families(table, joints)
     named = [family for family in families if family.of_joints and not set(family.columns) <= set(taken)]
     whole = [family.columns for family in named if family.whole]

@@ -38,6 +38,7 @@ from .urdf_text import ExportedUrdf, Robot, UrdfJoint, edited, unused_name
 _REVOLUTION = (-2 * math.pi, 2 * math.pi)  # limits of a continuous joint: readings of -pi to pi and of 0 to 2 pi
 _LONGEST = 50_000.0  # mm; no serial chain is as long
 _LARGEST, _IN_DEGREES = 15.0, 720.0  # rad: limits of joints end below; those in degrees are mostly between
+_SAME_PLACE = 1e-9  # mm: a probe nearer to the tip link than this is no tool beyond it
 _LISTED = 12  # links that a message names
 
 
@@ -103,8 +104,18 @@ def read_urdf(
         text = with_includes(text, Path(file))
         robot = parse_robot(text)
         source = UrdfSource(text, *_ends(robot, base, tip))
-        arm = urdf_chain(source).arm
-        return ArmSpecification(arm if probe is None else with_tool(arm, probe), Path(file).stem, urdf=source)
+        chain = urdf_chain(source)
+        arm = chain.arm if probe is None else with_tool(chain.arm, probe)
+        return ArmSpecification(arm, Path(file).stem, urdf=located(source, chain, arm))
+
+
+def located(source: UrdfSource, chain: UrdfChain, arm: Arm) -> UrdfSource:
+    """The same source with its links as seen from the frames of an arm, which may have a tool beyond the tip link."""
+    probe = np.asarray(chain.arm.probe)
+    without_tool = np.allclose(arm.probe, probe, rtol=0, atol=_SAME_PLACE)
+    first = tuple(map(tuple, chain.base.tolist()))
+    follows = chain.tip_joint is not None and without_tool
+    return source._replace(first=first, link=tuple(probe.tolist()), follows=follows)
 
 
 def urdf_chain(source: UrdfSource) -> UrdfChain:
@@ -211,7 +222,7 @@ def urdf_of(arm: Arm, nominal: ArmSpecification) -> ExportedUrdf:
     frames = calibrated_frames(chain.origins, before, after, chain.base)
     last = inverse(reduce(np.matmul, frames, np.eye(4)))
     tool = np.asarray(nominal.arm.probe) - np.asarray(chain.arm.probe)
-    has_tool = bool(np.linalg.norm(tool) > 1e-9)
+    has_tool = bool(np.linalg.norm(tool) > _SAME_PLACE)
     tip = last @ tip_frame(after, chain.base)
     # A tool is no part of the file: the tip link then follows the last D-H frame alone.
     link = last @ tip_frame(after._replace(probe=before.probe), chain.base) if has_tool else tip
@@ -327,6 +338,12 @@ def _joints_before(robot: Robot, link: str) -> list[UrdfJoint]:
         joints.append(robot.joint_before[link])
         link = joints[-1].parent
     return joints
+
+
+def joint_names(source: UrdfSource) -> list[str]:
+    """The names of the moving joints of the chain, from the base."""
+    path = _joints_between(parse_robot(source.text), source.base, source.tip)
+    return [joint.name for joint in path if joint.kind != "fixed"]
 
 
 def _joints_between(robot: Robot, base: str, tip: str) -> list[UrdfJoint]:

@@ -302,6 +302,9 @@ class UrdfSource(NamedTuple):
     text: str  # the whole file, and what it includes
     base: str  # name of the link that does not move
     tip: str  # name of the link at the end of the chain
+    first: tuple[tuple[float, ...], ...] = ()  # the arm's first frame in the base link, 4 x 4, mm
+    link: tuple[float, ...] = ()  # origin of the tip link in the last frame, mm; its axes are those of that frame
+    follows: bool = False  # whether an export moves the tip link to the calibrated probe
 
     @property
     def format(self) -> str:

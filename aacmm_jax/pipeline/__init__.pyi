@@ -4,3 +4,5 @@ from .capture_evaluation import EvaluationOptions as EvaluationOptions
 from .capture_simulation import SimulationOptions as SimulationOptions
 from .model_ladder import ComparedModels as ComparedModels
 from .single import CalibrationOptions as CalibrationOptions
+from .verification import Accuracy as Accuracy
+from .verification import Verification as Verification

@@ -33,12 +33,13 @@ from .automatic import (
     without_misplaced,
 )
 from .cross_validation import can_cross_validate, cross_validate
-from .data_corrections import corrected_capture, with_corrected_readings, with_prior_of_few
+from .data_corrections import camera_fits, corrected_capture, with_corrected_readings, with_prior_of_few
 from .hold_out import held_out_poses, tested, without_held_out
 from .reading_sets import with_other_readings
 from .single import CalibrationOptions, calibrate, identify
 
 _SOLVE = CalibrationOptions()
+_FEW_STEPS = 50  # of a calibration that does not converge at once
 
 
 class CaptureOptions(NamedTuple):
@@ -155,7 +156,10 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", IdentifiabilityWarning)
         solved = partial(_solved, chosen)
-        record = chosen.stage("Calibrating", lambda: recorded(solved(recording), recording))
+        # Images that are not those of the poses end in hundreds of steps, before the mistake is looked for.
+        brief = automatic and chosen.max_steps > _FEW_STEPS and not camera_fits(recording)
+        first = partial(_solved, chosen._replace(max_steps=_FEW_STEPS)) if brief else solved
+        record = chosen.stage("Calibrating", lambda: recorded(first(recording), recording))
         record = record._replace(decisions=decided)
         if automatic:
             further = chosen.model is None and nominal.arm.corrections is None
@@ -163,6 +167,9 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
             capture = capture if explanation is None else corrected_capture(capture, explanation) or capture
         # Where a mistake in the recording remains, every other remedy would only make up for it.
         mistake = None if not automatic or matches(record) else case_of(record).once(mistake_in_data)
+        if brief and mistake is None and not record.converged:
+            again = chosen.stage("Calibrating", lambda: recorded(solved(record.recording), record.recording))
+            record = again._replace(removed=record.removed, decisions=record.decisions)
         if mistake is None or mistake.of_bounds:
             if automatic:
                 record = chosen.stage("Checking bounds", lambda: with_wider_bounds(record, solved, recorded))

@@ -16,6 +16,7 @@ from ..data.capture import Capture
 from ..data.noise import CLASSES, ArmNoise, class_noise
 from ..data.observations.measured import MeasuredPoints
 from ..data.observations.observation import AbstractObservation, stated_u
+from ..data.observations.pixels import Pixels
 from ..data.recording import Recording
 from ..diagnostics.capture_check import check_capture, fits_as_recorded
 from ..diagnostics.reading_check import explanation_words
@@ -63,6 +64,16 @@ def with_prior_of_few(recording: Recording, options: Any) -> tuple[Recording, An
         "--seating-mm)."
     )
     return recording._replace(nominal=nominal), options, (says,)
+
+
+def camera_fits(recording: Recording) -> bool:
+    """Whether what cameras saw fits the arm as it is nominally, as far as that can be told; true without a camera."""
+    if not any(isinstance(part, Pixels) for part in recording.capture.observations):
+        return True
+    try:
+        return fits_as_recorded(recording.nominal.arm, recording.capture)
+    except InputError:  # too few poses
+        return True
 
 
 def with_corrected_readings(

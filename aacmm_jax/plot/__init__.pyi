@@ -21,6 +21,9 @@ from .residuals import pose_distances as pose_distances
 from .residuals import residual_patterns as residual_patterns
 from .residuals import residuals_by_kind as residuals_by_kind
 from .residuals import save_calibration_figure as save_calibration_figure
+from .socket_plate import SocketPlate as SocketPlate
+from .socket_plate import socket_plate_pdf as socket_plate_pdf
+from .socket_plate import socket_plate_stl as socket_plate_stl
 from .study import save_study_figures as save_study_figures
 from .study import study_convergence as study_convergence
 from .study import study_correlation as study_correlation

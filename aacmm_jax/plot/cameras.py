@@ -98,13 +98,16 @@ def _image(observations: list[Pixels], seen: list[Reprojection], number: int = 1
     )  # fmt: skip
 
 
-def _plot(image: Image, marks: tuple[Marks, ...], title: str = "") -> Plot:
-    """Marks on the image plane: x to the right, y downwards, and the edges of the image."""
+def _plot(image: Image, marks: tuple[Marks, ...], title: str = "", margin: float = 0.0) -> Plot:
+    """Marks on the image plane: x to the right, y downwards, and the edges of the image with a margin, px."""
     (left, top), (right, bottom) = image.low, image.high
     border = Marks("", [left, right, right, left, left], [top, top, bottom, bottom, top], "line", "soft", size=4)
     axes = [
         Axis(f"{name} [{image.model.unit}]", *ends, round_ticks(min(ends), max(ends)))
-        for name, ends in (("x", (float(left), float(right))), ("y", (float(bottom), float(top))))
+        for name, ends in (
+            ("x", (float(left) - margin, float(right) + margin)),
+            ("y", (float(bottom) + margin, float(top) - margin)),
+        )
     ]
     return Plot(axes[0], axes[1], (border, *marks), title=title, image=True)
 
@@ -234,7 +237,7 @@ def distortion_chart(image: Image) -> Chart | None:
         return None
     nodes, shift = nodes.T[known], shift.T[known]
     sizes = np.linalg.norm(shift, axis=1)
-    factor = _magnification(sizes, 0.6 * cell)  # so that arrows at the edges stay in the image
+    factor = _magnification(sizes, 1.2 * cell)
     shade, limits = shades(sizes)
     words = [f"at ({a:.0f}, {b:.0f}) px: {size:.3g} px" for (a, b), size in zip(nodes, sizes.tolist(), strict=True)]
     marks = (
@@ -249,7 +252,7 @@ def distortion_chart(image: Image) -> Chart | None:
     unknown = int(np.sum(~known))
     description += f" In {pluralise(unknown, 'cell')} the distortion folds back." if unknown else ""
     title = f"Distortion of {image.camera}"
-    plot = _plot(image, marks, f"arrows: {factor:g} times the displacement")
+    plot = _plot(image, marks, f"arrows: {factor:g} times the displacement", cell)  # arrows at the edges lead outwards
     return Chart(f"distortion-{image.number}", title, description, (plot,))
 
 
@@ -330,7 +333,10 @@ def camera_coverage(record: CalibrationRecord, camera: str | None = None, axes: 
 def camera_residuals(record: CalibrationRecord, camera: str | None = None, axes: Any = None) -> Any:
     """Plot the residuals of all corners as arrows on the image plane of a camera; the title has the magnification.
 
-    The arguments are those of `camera_coverage`.
+    Args:
+        record: The calibration.
+        camera: Name of the camera; the first one if None. `InputError` if the calibration has none of this name.
+        axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
         >>> aj.plot.camera_residuals(seen).figure.savefig("figure.svg")
@@ -342,7 +348,11 @@ def camera_distortion(record: CalibrationRecord, camera: str | None = None, axes
     """Plot how far the lens of a camera displaces what it would show without distortion; the title has the
     magnification of the arrows.
 
-    The arguments are those of `camera_coverage`. `InputError` if the camera has no distortion.
+    Args:
+        record: The calibration.
+        camera: Name of the camera; the first one if None. `InputError` if the calibration has none of this name, or if
+            it has no distortion.
+        axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
         >>> aj.plot.camera_distortion(seen).figure.savefig("figure.svg")
@@ -374,7 +384,8 @@ def camera_poses(record: CalibrationRecord, axes: Any = None) -> Any:
         for i, line in reversed(list(enumerate(moving))):
             axes.plot(*line.T, color=TONES["soft"] if i else TONES["main"], linewidth=1.5 if not i else 0.6)
         axes.plot(*still.T, color=TONES["accent"], linewidth=2)
-    axes.set_aspect("equal")
+    ranges = [np.ptp(ends) for ends in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
+    axes.set_box_aspect(ranges, zoom=0.85)  # as equal axes, with room for their labels
     return axes
 
 

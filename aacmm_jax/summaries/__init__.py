@@ -6,5 +6,8 @@ when it is first asked for: printing what a file holds needs none of those that 
 
 import lazy_loader as _lazy_loader
 
-_MODULES = {"arm_survey", "calibration", "cameras", "compared_models", "correction", "drift", "evaluation", "planning"}
+_MODULES = {
+    *("arm_survey", "calibration", "cameras", "compared_models", "correction", "drift", "evaluation", "planning"),
+    "verification",
+}
 __getattr__, __dir__, __all__ = _lazy_loader.attach(__name__, submodules=_MODULES)

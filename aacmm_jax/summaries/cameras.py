@@ -34,9 +34,13 @@ def image_rows(recording: Recording) -> list[dict[str, Any]]:
 
 
 def camera_rows(record: CalibrationRecord) -> list[dict[str, Any]]:
-    """What each observation of a camera says: mount, place, intrinsics, reprojection; mm, rad and px, u with k = 1."""
+    """What each observation of a camera says: mount, place, intrinsics, reprojection; mm, rad and px, u with k = 1.
+
+    Of an arm from a URDF, mounts are in the tip link and places in the base link.
+    """
     rows = []
     geometry, covariances = record.observed.geometry, record.observed.geometry_covariance
+    (base, first), (last, in_last) = _links(record)
     for observation in record.recording.capture.observations:
         if not isinstance(observation, Pixels):
             continue
@@ -44,7 +48,7 @@ def camera_rows(record: CalibrationRecord) -> list[dict[str, Any]]:
         moving, still = (observation.camera, observation.board)[:: 1 if observation.on_arm else -1]
         place = np.asarray(covariances[observation.frame])
         mount = _placed(
-            mount_of(observation, geometry),
+            in_last @ mount_of(observation, geometry),
             np.asarray(geometry[observation.orientation]),
             np.asarray(covariances[offset_of(observation.target)]),
             np.asarray(covariances[observation.orientation]),
@@ -64,11 +68,23 @@ def camera_rows(record: CalibrationRecord) -> list[dict[str, Any]]:
             "reprojection_rms": seen.rms,
             "reprojection_rms_mm": float(np.sqrt(np.mean(seen.in_mm[seen.seen] ** 2))),
             "distance_mm": float(np.median(seen.distance[seen.seen])),
-            "mount": {"of": moving, "in": "last frame"} | mount,
-            "place": {"of": still, "in": "base"} | _placed(frame_of(frame), frame[:3], place[3:, 3:], place[:3, :3]),
+            "mount": {"of": moving, "in": last} | mount,
+            "place": {"of": still, "in": base}
+            | _placed(first @ frame_of(frame), frame[:3], place[3:, 3:], place[:3, :3]),
             "intrinsics": _intrinsics(observation, seen.intrinsics, covariances),
         })  # fmt: skip
     return rows
+
+
+def _links(record: CalibrationRecord) -> tuple[tuple[str, np.ndarray], tuple[str, np.ndarray]]:
+    """What places and mounts are given in, and what takes them there from the first and from the last frame."""
+    nominal, to_link = record.recording.nominal, np.eye(4)
+    source = nominal.urdf
+    if source is None or not source.link:
+        return ("base", np.eye(4)), ("last frame", to_link)
+    moved = np.asarray(record.calibrated.arm.probe) - np.asarray(nominal.arm.probe)
+    to_link[:3, 3] = -np.array(source.link) - (moved if source.follows else 0.0)
+    return (source.base, np.array(source.first)), (source.tip, to_link)
 
 
 def _placed(

@@ -66,10 +66,15 @@ class Agreeing(NamedTuple):
         observed = Observed.of(capture, arm, lengths=False)
         source = space if targets_of is None else Parameters(targets_of, space.names)
         z = np.asarray(source.vector())
-        z = np.concatenate([z, np.asarray(observed.start(source, z))])
+        z = start = np.concatenate([z, np.asarray(observed.start(source, z))])
         for _ in range(_ROUNDS):
             # What is certified does not count: the fit in mm.
-            new = np.asarray(_linear(source, observed, z, certified=0.0).fitted(np.arange(len(z)) < p))
+            linear = _linear(source, observed, z, certified=0.0)
+            # Of images that are not those of the poses, steps lead to corners at the height of the camera.
+            if not all(np.isfinite(rows.values).all() and np.isfinite(rows.by_tip).all() for rows in linear.point.rows):
+                z = start
+                break
+            new = np.asarray(linear.fitted(np.arange(len(z)) < p))
             step, z = np.max(np.abs(new - z), initial=0.0), new
             if step < _FITTED:
                 break
@@ -192,7 +197,11 @@ def _moved(linear: Linearisation) -> Observed:
     for group, rows, error in zip(observed.layout.groups, linear.point.rows, linear.errors, strict=True):
         by_units = np.moveaxis(np.asarray(error.by_readings) * units[:, None], -1, 0)
         turned = by_units.swapaxes(-1, -2)
-        step = turned @ pseudo_inverse(by_units @ turned) @ np.asarray(rows.values).T[..., None]
+        # Poses that a diverged fit has next to a singularity stay: corners at the height of the camera, for instance.
+        values, products = np.asarray(rows.values).T[..., None], by_units @ turned
+        finite = np.isfinite(products).all(axis=(1, 2)) & np.isfinite(values).all(axis=(1, 2))
+        step = np.zeros((*turned.shape[:2], 1))
+        step[finite] = turned[finite] @ pseudo_inverse(products[finite]) @ values[finite]
         size = np.linalg.norm(step, axis=1, keepdims=True)
         step = (step * np.minimum(1.0, _LONGEST_STEP / np.maximum(size, 1e-300)))[..., 0]
         poses = np.arange(len(q))[group.index]

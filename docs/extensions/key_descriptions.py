@@ -215,6 +215,7 @@ DESCRIPTIONS = {
     "KitPixels.distance": "Least and largest distance of the target from the camera, mm, at which images are sharp.",
     "KitPixels.tilt_deg": "Largest angle between the target's normal and the line of sight, deg.",
     "KitPixels.u": "Standard deviation of a coordinate of a corner, px.",
+    "KitPixels.poses": "Number of poses that are simulated. A plan chooses its own number.",
     "_Kit.points": "An instrument that measures points.",
     "Distribution.normal": "Standard deviation of a normal distribution.",
     "_Box.rotation": "Rotation vector, rad.",

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from aacmm_jax.camera.consistency import misfits
 from aacmm_jax.camera.detection import detect, overlay, read_image
 from aacmm_jax.camera.rendering import render
 from aacmm_jax.data.targets import Charuco, Checkerboard, PointTable, TagGrid
@@ -40,6 +41,18 @@ def test_a_fisheye_camera_bends_boards_without_making_them_others(name):
     found = errors(detect(image, target), target, true)
     assert len(found) >= len(target.ids) - 4
     assert np.abs(found).max() < 0.6
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_corners_that_a_wide_lens_bends_by_many_pixels_are_those_of_the_target(seed):
+    """A corner that is taken for its neighbour is not."""
+    target = TARGETS["charuco"]
+    _, true = scene(target, seed, model="fisheye", nearer=270.0)
+    near = np.all((true > -200) & (true < np.array(SIZE) + 200), axis=1)
+    points, corners = target.points[near], true[near]
+    assert misfits(points, corners, SIZE).max() < 0.5
+    corners[[5, 6]] = corners[[6, 5]]
+    assert misfits(points, corners, SIZE).max() > 5.0
 
 
 def mirrored(target):

@@ -39,3 +39,5 @@ def test_a_board_seen_from_behind_is_not_drawn():
 def test_a_camera_without_images_is_one_sentence():
     assert_refused(lambda: render(BOARD, np.eye(4), "points", np.zeros(0), SIZE), "makes no images")
     assert_refused(lambda: render(BOARD, np.eye(4), "pinhole", PINHOLE[:3], SIZE), "has 3 intrinsics")
+    huge = (10**6, 10**6)
+    assert_refused(lambda: render(BOARD, np.eye(4), "pinhole", PINHOLE, huge), "1000000 x 1000000 px", "image_size")

@@ -31,6 +31,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_hand_eye_calibration(aacmm, folder, tmp_path):
     shown = aacmm("calibrate", folder / "on-arm.h5", "-o", "c.h5", "--arm-fixed").stdout
     for part in ("with the arm as it is", "reprojection error 0.", "at the target", "mount of webcam", "exact"):
@@ -51,6 +52,7 @@ def test_hand_eye_calibration(aacmm, folder, tmp_path):
     assert "--camera" in aacmm("export", "c.h5", "--camera", "webcam", expect=2).stderr
 
 
+@pytest.mark.slow
 def test_a_camera_that_stands_still(aacmm, folder):
     aacmm("calibrate", folder / "fixed.h5", "-o", "c.h5", "--arm-fixed")
     (row,) = json.loads(aacmm("show", "c.h5", "--json").stdout)["cameras"]
@@ -62,3 +64,63 @@ def test_a_camera_that_stands_still(aacmm, folder):
 def test_nothing_but_the_arm_is_refused(aacmm, folder):
     said = aacmm("calibrate", folder / "on-arm.h5", "-o", "c.h5", "--arm-fixed", "--free", "beta_2", expect=2).stderr
     assert "--arm-fixed" in said
+
+
+KIT = """
+[[target]]
+name = "board"
+kind = "charuco"
+squares = [6, 5]
+size = 30.0
+marker = 22.0
+bar = { nominal = 100, measured = 99.5, u = 0.05 }
+[[camera]]
+name = "webcam"
+image_size = [320, 240]
+intrinsics = { fx = 300, fy = 305, cx = 160, cy = 120, k1 = -0.1 }
+[[pixels]]
+name = "looks"
+camera = "webcam"
+target = "board"
+mount = [60, -10, 20, 0.1, 0.2, 0.3]
+frame = [3.14159265, 0, 0, -700, -200, 0]
+distance = [250, 400]
+u = 0.001
+poses = 3
+"""
+SIMULATE = ("simulate", "ur10e", "-o", "s.h5", "--kit", "kit.toml")
+
+
+@pytest.mark.slow
+def test_rendered_images_are_read_as_they_were_simulated(aacmm, tmp_path):
+    """Readings with their noise, a board that was printed too small; the corners without bias."""
+    pytest.importorskip("cv2")
+    (tmp_path / "kit.toml").write_text(KIT)
+    aacmm(*SIMULATE, "--images", "rendered", "--encoder-arcsec", "50", "--blur-px", "0.7")
+    aacmm("import", "rendered/capture.toml", "-o", "i.h5")
+    simulated, read = (aj.files.load_capture(tmp_path / f"{name}.h5").capture.observations[0] for name in "si")
+    np.testing.assert_allclose(read.q, simulated.q, atol=1e-8)
+    np.testing.assert_allclose(read.points[0, 5], np.asarray(simulated.points)[0, read.ids[0][5]])
+    assert read.images == ("looks/1.jpg", "looks/2.jpg", "looks/3.jpg")
+    assert read.seen.sum() > 50
+    true = np.asarray(simulated.corners)[np.nonzero(read.seen)[0], np.array(read.ids)[read.seen]]
+    apart = np.asarray(read.corners)[read.seen] - true
+    assert np.abs(apart.mean(axis=0)).max() < 0.05
+    assert np.abs(apart).max() < 0.6
+
+
+@pytest.mark.parametrize(
+    ("kit", "options", "says"),
+    [
+        (KIT, ("--blur-px", "1"), "--images FOLDER"),
+        (KIT.replace("intrinsics =", "# "), (), "'webcam' has no intrinsics"),
+        (KIT.replace('"looks"', '".."'), (), "cannot be the name of a folder"),
+        ('[[socket]]\nname = "cone"\npoint = [400, 200, 300]\nposes = 2\n', (), "no camera"),
+    ],
+    ids=["no images", "no intrinsics", "folder above", "no camera"],
+)
+def test_images_that_cannot_be_rendered_are_refused(aacmm, tmp_path, kit, options, says):
+    (tmp_path / "kit.toml").write_text(kit)
+    images = () if options else ("--images", "rendered")
+    assert says in aacmm(*SIMULATE, *images, *options, expect=2).stderr
+    assert not (tmp_path / "s.h5").exists()

@@ -22,6 +22,8 @@ COMMANDS = (
     *("arm", "demo", "simulate", "import", "calibrate", "evaluate", "export", "correct", "show", "plan", "compare"),
     "report",
     "target",
+    "verify",
+    "sockets",
 )
 SIMULATE = (
     *("simulate", "cheng2018-simulation", "-o", "capture.h5", "--seed", 4),

@@ -6,7 +6,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.diagnostics import reading_check, reading_search
-from aacmm_jax.diagnostics.capture_check import check_capture, search_couplings
+from aacmm_jax.diagnostics.capture_check import check_capture, fits_as_recorded, search_couplings
 from aacmm_jax.diagnostics.reading_check import reading_check_summary
 from aacmm_jax.kinematics import with_corrections
 from aacmm_jax.kinematics.parameters import ArmSpecification
@@ -77,3 +77,57 @@ def test_a_calibration_sets_them_unless_a_model_without_them_is_stated(model):
     name = record.names.index("coupled2_3")
     value, u = record.vectors()["calibrated"][name], np.sqrt(record.covariance[name, name])
     assert abs(value + 1.0007) < min(3 * u, 1e-4)
+
+
+def photographed(on_arm):
+    """Images by a camera on an arm near the nominal one, or of a board on it: the nominal arm, and the observation."""
+    nominal = aj.load_arm("ur10e")
+    true = aj.perturbed_arm(aj.Parameters.free_of(nominal), length=0.3, angle=5e-3, seed=1)
+    board = aj.camera.target_of("charuco", squares=[6, 5], size=30.0, marker=22.0)
+    eye = kinds.SimulatedPixels(
+        "eye", 20, "webcam", "board", board.points, (600.0, 610.0, 319.5, 239.5), (640, 480), on_arm=on_arm,
+        frame=(np.pi, 0, 0, -700, -200, 0) if on_arm else (1.2, 1.2, -1.2, -1200, -200, 400),
+        mount=(60, 0, 20, 0, 0, 0), distance=(250, 400), u=0.2,
+    )  # fmt: skip
+    return nominal, aj.simulate(true, {}, observations=[eye], noise=NOISE, seed=1).observations[0]
+
+
+def columns(*order):
+    return lambda q: q[:, list(order)]
+
+
+MISREAD = {
+    "exchanged": (columns(0, 1, 2, 3, 5, 4), ((0, 1, 2, 3, 5, 4), (1,) * 6)),
+    "sign": (lambda q: q * [1, 1, -1, 1, 1, 1], (tuple(range(6)), (1, 1, -1, 1, 1, 1))),
+}
+
+
+@pytest.mark.parametrize("on_arm", [True, False])
+def test_readings_fit_what_a_camera_saw_or_do_not(on_arm):
+    nominal, eye = photographed(on_arm)
+    assert fits_as_recorded(nominal, aj.Capture({}, observations=[eye]))
+    for wrong, _ in MISREAD.values():
+        assert not fits_as_recorded(nominal, aj.Capture({}, observations=[eye.changed(q=wrong(np.asarray(eye.q)))]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("on_arm", [True, False])
+@pytest.mark.parametrize("mistake", MISREAD)
+def test_what_a_camera_saw_shows_the_order_and_signs_of_the_columns(on_arm, mistake):
+    nominal, eye = photographed(on_arm)
+    wrong, found = MISREAD[mistake]
+    check = check_capture(nominal, aj.Capture({}, observations=[eye.changed(q=wrong(np.asarray(eye.q)))]))
+    assert check.explained
+    assert check.best[:2] == found
+
+
+@pytest.mark.slow
+def test_a_calibration_by_a_camera_survives_two_images_that_are_exchanged():
+    _, eye = photographed(True)
+    order = np.array([0, 1, 2, 4, 3, *range(5, 20)])
+    capture = aj.Capture({}, observations=[eye.changed(q=np.asarray(eye.q)[order])])
+    specification = aj.files.load_specification("ur10e", capture=capture)
+    record = aj.calibrate_capture(aj.Recording(capture, specification), cross_validate=False)
+    assert record.converged
+    assert "pose 4" in record.removed[0].group
+    assert "exchanged" in record.removed[0].group

@@ -86,6 +86,7 @@ def test_poses_of_sockets(nominal, sockets, mistake, poses, says):
     assert all(says in found.says for found in mistakes)
 
 
+@pytest.mark.slow
 def test_two_points_of_a_plate_under_each_other_s_name(nominal, plates):
     one, two = plates
     renamed = tuple({"b": "c", "c": "b"}.get(point, point) for point in one.point)
@@ -106,7 +107,9 @@ def record_of(nominal, capture):
     [
         ({}, "", ()),
         ({"B": "C", "C": "B"}, "the names of sockets B and C are exchanged", ("B", "C")),
-        ("cm", "measured values are in cm, but were read as mm (reference lengths)", ()),
+        pytest.param(
+            "cm", "measured values are in cm, but were read as mm (reference lengths)", (), marks=pytest.mark.slow
+        ),
         ("tool", "mm from where it is stated in the arm's file, near 0, -1, 102 mm", ("probe_z",)),
     ],
 )
@@ -125,6 +128,7 @@ def test_names_lengths_and_tool(nominal, sockets, changed, says, concerns):
         assert set(concerns) <= set(found.concerns)
 
 
+@pytest.mark.slow
 def test_a_calibration_leaves_out_what_was_mixed_up(nominal, true, sockets):
     """As `aacmm calibrate` does: what is left out is named first, and the arm is as good as without the mistake."""
     recording = aj.Recording(aj.Capture(exchanged({n: q.copy() for n, q in sockets.items()}), LENGTHS), nominal)
@@ -146,6 +150,7 @@ def test_nothing_is_left_out_where_poses_scatter_without_a_gap(nominal, sockets)
     assert misplaced_poses(rough_fit(nominal, capture), capture) == []
 
 
+@pytest.mark.slow
 def test_readings_that_are_late_at_an_instrument(true, nominal):
     """No pose fits, so that the nominal arm shows it."""
     box = [[200, -300, 100], [600, 300, 500]]

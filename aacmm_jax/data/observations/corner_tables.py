@@ -15,6 +15,7 @@ from .pixels import Pixels
 
 _FAR = 5.0  # robust standard deviations, beyond which a corner takes no part in a start
 _LEAST_U = 1e-3  # px
+_MISFIT, _BETTER = 1.0, 3.0  # px RMS that stated intrinsics leave, if others leave less by this factor: a mistake
 
 
 class Camera(NamedTuple):
@@ -111,7 +112,7 @@ def pixels_of(
     intrinsics, u_intrinsics, alone = _started(seen, camera)
     if table.u is None:
         u = u * max(alone.chi if alone.degrees_of_freedom > 0 else 1.0, _LEAST_U)
-    return Pixels(
+    made = Pixels(
         name,
         q,
         **filled,
@@ -126,6 +127,8 @@ def pixels_of(
         images=None if table.names is None else tuple(table.names),
         u_scale=float(getattr(target, "u_scale", 0.0)),
     )
+    _check_intrinsics(seen, camera, u_intrinsics, alone)
+    return made
 
 
 def _whole(values: Numbers, what: str) -> np.ndarray:
@@ -180,15 +183,35 @@ def _started(seen: Corners, camera: Camera) -> tuple[np.ndarray, np.ndarray, Cam
         default = {"pinhole": 5}.get(camera.model, seen.model.counts[-1] - 4)
         count = 4 + (default if camera.coefficients is None else camera.coefficients)
         seen.model.check_count(count, where)
-        largest = seen.values[seen.present].max(axis=0) + 1
-        size = np.asarray(largest if size is None else size, dtype=float)
-        stated, u = started_intrinsics(seen, count, size), np.full(count, np.inf)
-    # A free number has a wide prior here, so that images which do not show it give a start nearby.
-    sizes = [0.5 * stated[:2].mean(), 0.2 * stated[2:4].mean()] if len(stated) else []
-    wide = np.concatenate([np.repeat(sizes, 2), np.ones(max(len(stated) - 4, 0))])
-    prior = np.where(np.isfinite(u), np.maximum(u, 1e-12), wide)
+        stated, u = started_intrinsics(seen, count, _size_of(seen, size)), np.full(count, np.inf)
+    prior = np.where(np.isfinite(u), np.maximum(u, 1e-12), _wide(stated))
     alone = calibrated_camera(seen, stated, u > 0, prior)
     near = ~(alone.far(seen) > _FAR)
     if not near.all():
         alone = calibrated_camera(seen._replace(present=seen.present & near), alone.intrinsics, u > 0, prior)
     return np.where(np.isfinite(u), stated, alone.intrinsics), u, alone
+
+
+def _check_intrinsics(seen: Corners, camera: Camera, u: np.ndarray, alone: CameraCalibration) -> None:
+    """Raise `InputError` where others than the stated intrinsics fit the corners far better."""
+    if not len(u) or not np.all(np.isfinite(u)) or alone.rms < _MISFIT:
+        return
+    start = started_intrinsics(seen, len(u), _size_of(seen, camera.image_size))
+    free = calibrated_camera(seen, start, prior=_wide(start))
+    if free.rms < alone.rms / _BETTER:
+        raise InputError(
+            f"the stated intrinsics of camera '{camera.name}' leave residuals of {alone.rms:.2g} px RMS, and others "
+            f"(fx = {free.intrinsics[0]:.0f}, fy = {free.intrinsics[1]:.0f} px) leave {free.rms:.2g} px; they may be "
+            "those of another image size or camera: correct them, or state that they are free."
+        )
+
+
+def _wide(intrinsics: np.ndarray) -> np.ndarray:
+    """Standard deviations of a wide prior, so that images which do not show a number give a start nearby."""
+    sizes = [0.5 * intrinsics[:2].mean(), 0.2 * intrinsics[2:4].mean()] if len(intrinsics) else []
+    return np.concatenate([np.repeat(sizes, 2), np.ones(max(len(intrinsics) - 4, 0))])
+
+
+def _size_of(seen: Corners, stated: Sequence[float] | None) -> Float[np.ndarray, "2"]:
+    """Width and height of the images, px; at least what the corners need."""
+    return np.asarray(seen.values[seen.present].max(axis=0) + 1 if stated is None else stated, dtype=float)

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from ...core.arguments import OneOf
 from ...core.errors import InputError
-from ...core.rotations import rotation_matrix
+from ...core.rotations import rotation_matrix, rotation_vector
 from ..cameras.camera import AbstractCamera, camera_models
 from .declared import FREE, declared
 from .observation import Readings, Transforms
@@ -64,6 +64,7 @@ class SimulatedPixels(AbstractSimulated):
     u: float = declared("standard deviation of a coordinate of a corner", "px", default=0.3)
     u_scale: float = declared("relative standard uncertainty of the target's scale", "1", default=0.0)
     scale: float = declared("true scale of the target", "1", default=1.0)
+    true_views: bool = declared("whether the true views are recorded, instead of those of the corners", default=False)
 
     def completed(self, where: str) -> Mapping[str, Any]:
         OneOf(camera_models())(self.model, f"model of {where}")
@@ -109,6 +110,7 @@ class SimulatedPixels(AbstractSimulated):
                 f"{self.poses} poses are wanted; move the target, or change the distance or the tilt."
             )
         corners, k = corners[chosen], len(self.points)
+        views = self._views(transforms[chosen]) if self.true_views else None
         return Pixels(
             self.name,
             q[chosen],
@@ -124,19 +126,31 @@ class SimulatedPixels(AbstractSimulated):
             u_intrinsics=self.u_intrinsics,
             image_size=self.image_size,
             u_scale=self.u_scale,
+            views=views,
         )
 
     def measurable(self, transforms: Transforms) -> Bool[np.ndarray, " m"]:
         return self._seen(transforms)[0]
 
-    def _seen(self, transforms: Transforms) -> tuple[Bool[np.ndarray, " m"], Float[np.ndarray, "m k d"]]:
-        """Which poses have the whole target in view, and its corners."""
+    def _placed(self, transforms: Transforms) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Axes ``(m, 3, 3)`` and origin ``(m, 3)`` of the camera, and those of the target, in the base frame."""
         held, still = (np.asarray(rotation_matrix(w)) for w in (self.mount[3:], self.frame[:3]))
         turn = transforms[:, :3, :3] @ held
         assert self.offset is not None
         origin = transforms[:, :3, 3] + transforms[:, :3, :3] @ (self.mount[:3] - self.offset)
         fixed = np.broadcast_to(still, turn.shape), np.broadcast_to(self.frame[3:], origin.shape)
-        (camera, centre), (board, place) = ((turn, origin), fixed) if self.on_arm else (fixed, (turn, origin))
+        return (turn, origin, *fixed) if self.on_arm else (*fixed, turn, origin)
+
+    def _views(self, transforms: Transforms) -> Float[np.ndarray, "m 6"]:
+        """Rotation vectors and origins of the target in the camera's frame."""
+        camera, centre, board, place = self._placed(transforms)
+        turns = camera.swapaxes(1, 2) @ board
+        origins = np.einsum("mji,mj->mi", camera, place - centre)
+        return np.concatenate([[rotation_vector(turn) for turn in turns], origins], axis=1)
+
+    def _seen(self, transforms: Transforms) -> tuple[Bool[np.ndarray, " m"], Float[np.ndarray, "m k d"]]:
+        """Which poses have the whole target in view, and its corners."""
+        camera, centre, board, place = self._placed(transforms)
         points = self.scale * self.points @ board.swapaxes(1, 2) + (place - centre)[:, None]
         before = np.moveaxis(points @ camera, -1, 0)  # (3, m, k)
         model = self.camera_model

@@ -39,7 +39,7 @@ _CORNERS = (1, 0, 3, 2)
 _TYPE = re.compile(r"[A-Za-z]\w*(/msg)?/[A-Za-z]\w*", re.ASCII)
 _FIELD = re.compile(r"[A-Za-z]\w*", re.ASCII)
 _COMPRESSED = b"\x28\xb5\x2f\xfd"  # as each message may be; CDR begins with other bytes
-_LARGEST_UNPACKED = 2**30
+_UNPACKED = 2**28  # bytes that even a small file may unpack to
 _NANOSECOND = 1e-9
 
 
@@ -120,10 +120,12 @@ def _unpacked(content: bytes) -> bytes:
         from backports import zstd  # of rosbags
 
     with zstd.open(io.BytesIO(content), "rb") as stream:
-        unpacked = stream.read(_LARGEST_UNPACKED + 1)
-    if len(unpacked) > _LARGEST_UNPACKED:
-        raise InputError(f"unpacks to more than {_LARGEST_UNPACKED // 2**20} MiB; give a smaller recording.")
-    return unpacked
+        unpacked, limit = bytearray(), _UNPACKED + 2 * len(content)
+        while part := stream.read(2**20):
+            unpacked += part
+            if len(unpacked) > limit:
+                raise InputError(f"unpacks to more than {limit // 2**20} MiB; give a smaller recording.")
+    return bytes(unpacked)
 
 
 def _register(store: Any, connection: Any) -> None:
@@ -160,6 +162,7 @@ class _Recorded:
 
     def __init__(self, topics: Mapping[str, Mapping[str, list[Any]]], seen: Mapping[str, str], tables: Sequence[str]):
         self._topics, self._seen, self._tables = topics, seen, tables
+        # The messages of robot_calibration of 2014 have no observations by sensor.
         self._available = {
             **{topic: _JOINTS for topic in topics.get(_JOINTS, ())},
             **{topic: kind for kind in _TRACKED for topic in topics.get(kind, ())},
@@ -167,7 +170,7 @@ class _Recorded:
             **{f"{topic}:{t.child_frame_id}": _TREE for topic, items in topics.get(_TREE, {}).items()
                for _, message in items for t in message.transforms},
             **{f"{topic}:{o.sensor_name}": _CALIBRATION for topic, items in topics.get(_CALIBRATION, {}).items()
-               for _, message in items for o in message.observations},
+               for _, message in items for o in getattr(message, "observations", ())},
         }  # fmt: skip
         for name in tables:
             if name not in self._available and name not in topics.get(_CALIBRATION, ()):

@@ -1,0 +1,106 @@
+"""Commands for who wants to know whether the maker's calibration is good: ``verify``, and ``sockets`` to print."""
+
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from .. import files, plot, summaries
+from ..files.inputs import InputFile
+from ..files.outputs import together, write_atomically
+from ..summaries.tables import View
+from . import options
+from .app import command, read_with_progress, show_summary, with_spinner
+from .options import argument, option, output
+
+
+@command(
+    "aacmm verify poses.toml --delivered kinematics.yaml",
+    "aacmm verify capture.h5 --delivered robot-as-delivered.urdf --tip tool0",
+)
+def verify(
+    capture: Path = argument(
+        "Manifest or capture of a handful of poses: in two sockets, of a board, or seen by a tracker. Its arm is the "
+        "nominal one.",
+        "CAPTURE.h5|MANIFEST.toml",
+    ),
+    delivered: str | None = option(
+        "Arm with the parameters that the maker or controller states: a kinematics.yaml, a URDF, an MJCF, or a TOML "
+        "file with D-H parameters and zero offsets. Default: as_found of the manifest.",
+        "ARM",
+    ),
+    base: str | None = options.BASE_LINK,
+    tip: str | None = options.TIP_LINK,
+    as_json: bool = options.JSON,
+) -> None:
+    """Test the parameters with which an arm was delivered on a handful of poses.
+
+    The command prints the error of the tip as delivered, with U; whether the delivered parameters are better or worse
+    than the nominal ones, or that these poses do not decide it; how many poses do; and what a recalibration would gain.
+    The position of the tool tip, the frames of instruments and the positions of sockets are unknown and are fitted.
+
+    The verdict is a two-sided test at the 5 % level. The exit code is 1 if the delivered parameters are worse.
+    """
+    from ..pipeline.verification import verify as run
+
+    recording = read_with_progress(capture) if capture.suffix == ".toml" else files.load_capture(InputFile(capture))
+    arm = None if delivered is None else files.load_specification(delivered, base=base, tip=tip)
+    checked = with_spinner("Verifying", lambda: run(recording, arm))
+    given = arm or recording.as_found
+    summary = summaries.verification.verification_summary(
+        checked, recording.nominal.name, delivered or ("" if given is None else given.name)
+    )
+    show_summary(summary, as_json, summaries.verification.verification)
+    if checked.verdict == "worse":
+        raise typer.Exit(1)
+
+
+@command(
+    "aacmm sockets -o sockets.stl --drawing sockets.pdf", "aacmm sockets -o sockets.stl --distance-mm 150 --ball-mm 10"
+)
+def sockets(
+    output: Path = output("Plate with two conical sockets to print (binary STL, mm).", "PLATE.stl"),
+    drawing: Path | None = option("Also draw it with its dimensions, true to scale (PDF, A4).", "DRAWING.pdf"),
+    distance_mm: float = option("Distance between the sockets.", default=100.0, min=0),
+    ball_mm: float = option("Diameter of the ball at the tip of the arm.", default=12.7, min=0),
+    as_json: bool = options.JSON,
+) -> None:
+    """Make a plate with two sockets for a 3-D printer.
+
+    A ball at the end of the arm rests in a cone and touches it in a circle. Printers err by tenths of a millimetre, so
+    measure the distance of the sockets with callipers over two balls. The command prints the lines that a manifest
+    needs.
+    """
+    plate = plot.SocketPlate(distance_mm, ball_mm)
+    with together(output, drawing):
+        with write_atomically(output) as temporary:
+            temporary.write_bytes(plot.socket_plate_stl(plate))
+        if drawing is not None:
+            with write_atomically(drawing) as temporary:
+                temporary.write_bytes(plot.socket_plate_pdf(plate))
+    summary: dict[str, Any] = {
+        "written": [str(path) for path in (output, drawing) if path is not None],
+        "size_mm": plate.size,
+        "over_balls_mm": distance_mm + ball_mm,
+        "ball_above_plate_mm": plate.ball_height,
+        "manifest": [
+            *("[[socket]]", 'name = "{socket}"', 'file = "{socket}.csv"', "", "[[length]]"),
+            *(
+                'from = "A"',
+                'to = "B"',
+                f"value = {distance_mm:g}  # mm: what you measured over the balls, less {ball_mm:g}",
+            ),
+            "u = 0.05",
+        ],
+    }
+    show_summary(summary, as_json, _plate)
+
+
+def _plate(summary: dict[str, Any]) -> View:
+    yield f"{', '.join(summary['written'])}: a plate of {' x '.join(f'{x:g}' for x in summary['size_mm'])} mm."
+    yield (
+        f"Print it solid, screw or clamp it to the table, and measure over two balls in the sockets, which should be "
+        f"{summary['over_balls_mm']:g} mm. The lines for the manifest:"
+    )
+    yield ""
+    yield from summary["manifest"]

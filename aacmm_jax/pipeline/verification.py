@@ -1,0 +1,389 @@
+"""Whether the parameters that a maker or controller states are good: `verify` tests them on a handful of poses.
+
+Both arms, nominal and as delivered, are compared with the same poses, after what a maker does not state is eliminated
+from each: the tip of the tool, the frames of base and instrument, and the positions of sockets. What is left of the two
+differs by D = r_nominal - r_delivered, which both arms predict. The regression r_nominal = b D + error says how much of
+the stated correction is real: all of it where b = 1, nothing where b = 0. The delivered arm has the smaller sum of
+squares if and only if b > 1/2, so that b against 1/2 is the paired test. Errors of one pose may have any covariance;
+their standard error is that of the cluster-robust estimator CR3, with degrees of freedom after Satterthwaite (Bell and
+McCaffrey 2002, Survey Methodology 28, 169-181).
+
+Poses in two sockets are no sample of the working volume. So a verdict needs a second test: the share b over the whole
+volume, by the posterior of a calibration with these poses whose prior is about the *other* arm. It is about the nominal
+arm (b = 0) where the verdict is "better", and about the delivered one (b = 1) where it is "worse": what these poses do
+not show speaks against the verdict.
+"""
+
+import math
+import warnings
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..calibration.solve import solve
+from ..calibration.task import Solving, task_of
+from ..core.arguments import checked_arguments
+from ..core.distributions import chi_square_quantile, student_quantile, student_tail
+from ..core.errors import IdentifiabilityWarning, InputError
+from ..core.numpy_or_jax import to_numpy
+from ..data.recording import Recording
+from ..diagnostics.equations import LEAST_U, PROBE
+from ..kinematics.arm import (
+    Arm,
+    by_joint,
+    joint_limits,
+    natural_steps,
+    parameter_names,
+    reading_as,
+    without_corrections,
+)
+from ..kinematics.parameters import ArmSpecification, Bounds, Parameters
+from ..uncertainty.linearisation import Linearisation
+
+Verdict = Literal["better", "worse", "not decided"]
+LEVEL = 0.05  # of the two-sided test
+_LENGTHS = 1000.0  # mm; half-width of the box of lengths and of the tip
+_TESTED = 300  # poses that stand for the working volume
+_SCALES, _NOISES = np.geomspace(0.02, 50, 40), np.geomspace(1e-3, 5, 40)  # of parameters' errors, and of the noise
+_FACTOR = 1.5  # ln 4.5
+_SAME = 1e-9  # of the residuals: the two arms do not differ in these poses
+_MOST = 1000  # poses that may be asked for
+_RANK = 1e-9
+_TURNED = 3e-3  # of the residuals: so far they follow some steps of 1 mrad, and of 1 mm in 1 m
+_FIXED = ("d_1",)  # a solve has at least one parameter; this one does not change
+_EXACT = 1e-6  # mm: smaller residuals are rounding errors
+_FEWEST = 4  # poses
+_LEAST_LEFT = 1e-6  # share of a row that the unknowns leave: what they explain whole shows no error
+
+
+class Accuracy(NamedTuple):
+    """RMS error of the tip by one arm, mm, with its 95 % interval.
+
+    Example:
+        >>> checked = aj.verify(aj.Recording(two_bars, nominal), nominal._replace(arm=true))
+        >>> print(checked.delivered.rms < checked.nominal.rms)
+        True
+    """
+
+    rms: float  # of the distance of a pose from its geometry, for the degrees of freedom that the geometry took
+    lower: float
+    upper: float
+    degrees_of_freedom: float  # effective ones, of the interval
+
+    @property
+    def expanded(self) -> float:
+        """The expanded uncertainty U: the distance to the farther end of the interval, mm."""
+        return max(self.upper - self.rms, self.rms - self.lower)
+
+
+class Verification(NamedTuple):
+    """What `verify` found.
+
+    Example:
+        >>> checked = aj.verify(aj.Recording(two_bars, nominal), nominal._replace(arm=true))
+        >>> print(checked.verdict, checked.poses, checked.equations, checked.unknowns)
+        better 60 182 15
+    """
+
+    verdict: Verdict  # of the delivered parameters against the nominal ones
+    nominal: Accuracy
+    delivered: Accuracy
+    share: float  # of the correction from nominal to delivered that is real: 1 all, 0 nothing, 0.5 no better than none
+    share_lower: float  # 95 % interval
+    share_upper: float
+    probability: float  # of such a share or a farther one from 0.5, where both arms are equally good
+    poses: int
+    equations: int
+    unknowns: int  # tip, frames and positions of sockets
+    decided_by: int | None  # poses that decide between the two, at these errors; None: more than a thousand
+    length_errors: Float[np.ndarray, "2 l"]  # of the reference lengths by both arms, mm
+    volume: (
+        float  # RMS error of the delivered arm over the working volume, as a calibration with these poses has it, mm
+    )
+    recalibrated: float  # and that of an arm calibrated with these poses, mm
+    verdict_here: Verdict  # for poses such as these
+    same: bool  # whether the two arms do not differ in these poses
+
+    @property
+    def gain(self) -> float:
+        """What a recalibration with these poses gains over the working volume, mm."""
+        return self.volume - self.recalibrated
+
+
+@checked_arguments
+def verify(recording: Recording, delivered: ArmSpecification | Arm | None = None) -> Verification:
+    """Test the parameters that a maker or controller states on a handful of poses, against the nominal parameters.
+
+    The tip of the tool, the frames of instruments and targets, and the positions of sockets are unknown and are
+    eliminated from both arms. The verdict is "better" or "worse" where a two-sided paired test at 5 % says so, else
+    "not decided": of two arms that are equally good, one in forty is called better and one in forty worse. What
+    the poses do not show of the rest of the working volume counts against any verdict.
+
+    Args:
+        recording: poses in sockets, on a board, or seen by a tracker; its nominal arm is the one to compare with.
+        delivered: the arm with the stated parameters; by default the recording's ``as_found``.
+
+    Returns:
+        Accuracy of both arms, the verdict, how many poses decide it, and what a recalibration would gain.
+
+    Raises:
+        InputError: no delivered arm is given, the arms differ in their joints, or there are too few poses.
+
+    Example:
+        >>> checked = aj.verify(aj.Recording(two_bars, nominal), nominal._replace(arm=true))
+        >>> print(checked.verdict, f"{checked.nominal.rms:.1f} mm become {checked.delivered.rms:.3f} mm")
+        better 1.8 mm become 0.014 mm
+    """
+    given = delivered if delivered is not None else recording.as_found
+    if given is None:
+        raise InputError(
+            "the delivered parameters are not given; name the controller's own file with --delivered, or as_found in "
+            "the manifest."
+        )
+    nominal = recording.nominal.arm
+    arm = given.arm if isinstance(given, ArmSpecification) else given
+    if (arm.joints, arm.prismatic) != (nominal.joints, nominal.prismatic):
+        raise InputError(
+            f"the delivered arm has {arm.joints} joints or other prismatic joints than the nominal arm, which has "
+            f"{nominal.joints}; give two descriptions of the same arm."
+        )
+    recording = to_numpy(recording)
+    plain = without_corrections(nominal)
+    arms = [to_numpy(plain), to_numpy(reading_as(without_corrections(arm), plain.recorded))]
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore", IdentifiabilityWarning)
+        fits = [_fitted(one, recording.capture) for one in arms]
+        sigma = max(math.sqrt(sum(float(fit.sigma) ** 2 for fit in fits) / len(fits)), _EXACT)
+        rows = [_Rows.of(fit.linear, sigma) for fit in fits]
+        unknowns = rows[1].rank
+        equations = len(rows[1].residual)
+        if equations - unknowns < 3 * 2:
+            raise InputError(
+                f"{equations} equations for {unknowns} unknowns (tip, frames and positions) test nothing; record at "
+                "least four poses in each of two sockets, or six that an instrument sees."
+            )
+        accuracies = [_accuracy(fit.linear, part) for fit, part in zip(fits, rows, strict=True)]
+        paired = _paired(*rows)
+        linear = [fit.linear for fit in fits]
+        # The prior is about the arm that the verdict would be against: few poses cannot decide by it.
+        from_nominal, from_delivered = (
+            _Volume.of(arms[i], arms[1 - i], linear[i], linear[1 - i], sigma) for i in (0, 1)
+        )
+    sure = {"better": from_nominal.probability, "worse": from_delivered.probability, "not decided": 0.0}
+    verdict: Verdict = paired.verdict if sure[paired.verdict] > 1 - LEVEL / 2 else "not decided"
+    return Verification(
+        verdict=verdict,
+        nominal=accuracies[0],
+        delivered=accuracies[1],
+        share=paired.share,
+        share_lower=paired.share - paired.half_width,
+        share_upper=paired.share + paired.half_width,
+        probability=paired.probability,
+        poses=rows[1].poses,
+        equations=equations,
+        unknowns=unknowns,
+        decided_by=paired.poses_to_decide(rows[1].poses),
+        length_errors=np.array([part.relations()[1][: len(recording.capture.lengths)] for part in linear]),
+        volume=from_delivered.error,
+        recalibrated=from_delivered.left,
+        verdict_here=paired.verdict,
+        same=paired.same,
+    )
+
+
+def _fitted(arm: Arm, capture: Any) -> "_Fit":
+    """The unknown geometry, and the tip where it is not a target's, that fit an arm best."""
+    targeted = not capture.sizes and all(observation.target for observation in capture.observations)
+    space = Parameters(arm, _FIXED if targeted else PROBE)
+    bounds = Bounds.around(arm, space, length=0.0 if targeted else _LENGTHS)
+    solution = solve(to_numpy(task_of(arm, capture, bounds, Solving(hold=None, replace_noise=False))))
+    return _Fit(solution.linear, solution.state.sigma)
+
+
+class _Fit(NamedTuple):
+    linear: Linearisation
+    sigma: Any  # standard deviation of a tip coordinate, mm
+
+
+class _Rows(NamedTuple):
+    """Residuals of one arm in the standard deviations of both, without what the unknowns explain."""
+
+    residual: Float[np.ndarray, " R"]
+    basis: Float[np.ndarray, "R k"]  # orthonormal, of what the unknowns explain
+    pose: np.ndarray  # of each row; a number of its own for each reference length and certified value
+    poses: int
+
+    @property
+    def rank(self) -> int:
+        """Number of unknowns that the rows determine."""
+        return self.basis.shape[1]
+
+    @classmethod
+    def of(cls, fit: Linearisation, sigma: float) -> "_Rows":
+        """With the weights of this standard deviation of a tip coordinate, mm."""
+        linear = Linearisation.at(fit.observed, fit.space, fit.z, sigma=sigma, least=LEAST_U)
+        values, columns, owner = _stacked(linear)
+        basis = _basis(columns[:, len(_FIXED) :] if fit.space.names == _FIXED else columns)
+        return cls(_without(basis, values), basis, owner, fit.observed.q.shape[0])
+
+
+def _stacked(linear: Linearisation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All rows in standard deviations, their derivatives, and the pose of each; reference lengths and certified values
+    have numbers of their own."""
+    values, columns, pose, first = [], [], [], 0
+    for white, derivative in zip(linear.white(), linear.dense(), strict=True):
+        rows, poses = white.shape
+        values.append(np.asarray(white).T.ravel())
+        columns.append(np.asarray(derivative).transpose(2, 1, 0).reshape(rows * poses, -1))
+        pose.append(np.repeat(first + np.arange(poses), rows))
+        first += poses
+    derivatives, errors, u = linear.relations()
+    weight = 1 / np.maximum(u, LEAST_U)
+    return (
+        np.concatenate([*values, weight * errors]),
+        np.concatenate([*columns, weight[:, None] * derivatives]),
+        np.concatenate([*pose, first + np.arange(len(errors))]),
+    )
+
+
+def _basis(columns: Float[np.ndarray, "R k"]) -> Float[np.ndarray, "R r"]:
+    """An orthonormal basis of what columns span."""
+    sizes = np.linalg.norm(columns, axis=0)
+    basis, values, _ = np.linalg.svd(columns / np.where(sizes > 0, sizes, 1.0), full_matrices=False)
+    return basis[:, values > _RANK * values.max(initial=1e-300)]
+
+
+def _without(basis: Float[np.ndarray, "R r"], values: Float[np.ndarray, "R ..."]) -> Float[np.ndarray, "R ..."]:
+    return values - basis @ (basis.T @ values)
+
+
+def _accuracy(fit: Linearisation, rows: _Rows) -> Accuracy:
+    squares = np.concatenate([np.asarray(part) for part in fit.observed.squared_distances(fit.point.rows)])
+    equations, freedom = len(rows.residual), len(rows.residual) - rows.rank
+    mean = max(float(squares.mean()), _EXACT**2)
+    # Squared distances of single poses scatter more, or less, than those of one normal distribution.
+    scatter = float(squares.var(ddof=1)) / len(squares)
+    effective = float(np.clip(2 * mean**2 / max(scatter, 1e-300), 1.0, freedom))
+    rms = math.sqrt(mean * equations / freedom)
+    low, high = (
+        rms * math.sqrt(effective / chi_square_quantile(level, effective)) for level in (1 - LEVEL / 2, LEVEL / 2)
+    )
+    return Accuracy(rms, low, high, effective)
+
+
+class _Paired(NamedTuple):
+    """The regression of the nominal residuals on what the correction predicts."""
+
+    share: float
+    u: float
+    half_width: float  # of the 95 % interval
+    probability: float
+    same: bool
+
+    @property
+    def verdict(self) -> Verdict:
+        if self.same or abs(self.share - 0.5) <= self.half_width:
+            return "not decided"
+        return "better" if self.share > 0.5 else "worse"
+
+    def poses_to_decide(self, poses: int) -> int | None:
+        """How many poses such as these decide, if the share stays as it is; None: more than a thousand."""
+        if self.same:
+            return None
+        apart = max(abs(self.share - 0.5), 1e-9)
+        needed = poses * (float(student_quantile(1 - LEVEL / 2, 1000)) * self.u / apart) ** 2
+        return max(math.ceil(needed), _FEWEST) if needed <= _MOST else None
+
+
+def _paired(nominal: _Rows, delivered: _Rows) -> _Paired:
+    basis, first = delivered.basis, nominal.residual
+    first = _without(basis, first)
+    step = first - delivered.residual
+    size = float(step @ step)
+    if size <= _SAME**2 * max(float(first @ first), 1e-300):
+        return _Paired(0.5, math.inf, math.inf, 1.0, True)
+    share = float(step @ first) / size
+    whole, rest = np.concatenate([basis, step[:, None] / math.sqrt(size)], axis=1), first - share * step
+    scores, spreads = [], []
+    for number in np.unique(delivered.pose):
+        rows = delivered.pose == number
+        values, vectors = np.linalg.eigh(np.eye(int(rows.sum())) - whole[rows] @ whole[rows].T)
+        kept = values > _LEAST_LEFT
+        score = vectors[:, kept] @ ((vectors[:, kept].T @ step[rows]) / values[kept])
+        scores.append(float(score @ rest[rows]))
+        # The score as a function of independent errors of all rows.
+        spread = -whole @ (whole[rows].T @ score)
+        spread[rows] += score
+        spreads.append(spread)
+    count, gram = len(scores), np.array(spreads) @ np.array(spreads).T
+    u = math.sqrt((count - 1) / count * float(np.sum(np.square(scores)))) / size
+    freedom = max(np.trace(gram) ** 2 / np.sum(gram**2), 1.0)
+    half_width = float(student_quantile(1 - LEVEL / 2, freedom)) * u
+    ratio = np.array([abs(share - 0.5) / max(u, 1e-300)])
+    probability = float(student_tail(ratio, np.array([freedom]))[0])
+    return _Paired(share, u, half_width, probability, False)
+
+
+class _Volume(NamedTuple):
+    """What these poses say of the errors of an arm over the working volume."""
+
+    probability: float  # that more than half of the step to the other arm is real there
+    error: float  # expected RMS error of the arm, mm
+    left: float  # and that of a calibration with these poses
+
+    @classmethod
+    def of(cls, arm: Arm, other: Arm, fit: Linearisation, of_other: Linearisation, sigma: float) -> "_Volume":
+        """``fit`` and ``of_other`` have the tips of both arms; ``sigma`` as for `_Rows`.
+
+        The parameters' errors are s times independent normal numbers of 1 mm and 1 mrad, as those of real arms, and the
+        noise is t times ``sigma``. Both are unknown: the posterior is summed over them, weighted by the evidence, with
+        s expected to be 1 to a factor of 4.5.
+        """
+        (arm, tip), (other, _) = _with_tip(arm, fit), _with_tip(other, of_other)
+        names = tuple(name for name in parameter_names(arm) if not name.startswith(("probe", "beta")))
+        geometry = np.asarray(fit.z)[len(fit.space.names) :]
+        space = Parameters(arm, (*names, *tip))
+        z = np.concatenate([np.asarray(space.vector()), geometry])
+        values, columns, _ = _stacked(Linearisation.at(fit.observed, space, z, sigma=sigma, least=LEAST_U))
+        unknowns, steps = _basis(columns[:, len(names) :]), natural_steps(names)
+        columns = _without(unknowns, columns[:, : len(names)] * steps)
+        values = _without(unknowns, values)
+        left, sizes, right = np.linalg.svd(columns, full_matrices=len(columns) < len(names))
+        # A turn or a scaling of everything moves no row but by turning or scaling its residual, which says nothing.
+        determined = sizes > max(_RANK * sizes[0], _TURNED * np.linalg.norm(values))
+        seen = np.where(determined, left.T @ values, 0.0)
+        unseen = len(values) - unknowns.shape[1] - int(np.sum(determined))
+        sizes, seen = (np.pad(part, (0, len(names) - len(part))) for part in (np.where(determined, sizes, 0), seen))
+        scale, noise = _SCALES[:, None, None], _NOISES[None, :, None]
+        variance = scale**2 * sizes**2 + noise**2
+        evidence = np.sum(np.where(sizes > 0, np.log(variance) + seen**2 / variance, 0.0), axis=2)
+        rest = max(float(values @ values - seen @ seen), 0.0)
+        evidence += (unseen * np.log(noise**2) + rest / noise**2)[..., 0] + (np.log(scale[..., 0]) / _FACTOR) ** 2
+        weight = np.exp(-(evidence - evidence.min()) / 2)
+        weight /= weight.sum()
+        # In the basis of the singular vectors the posterior's covariance is diagonal.
+        mean, spread = -(scale**2) * sizes * seen / variance, scale**2 * noise**2 / variance
+        limits = np.asarray(joint_limits(arm, None))
+        limits = np.where(np.array(by_joint(arm, True, False))[:, None], np.clip(limits, -math.pi, math.pi), limits)
+        q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_TESTED, arm.joints))
+        tips, turned = np.asarray(arm.position(q)), np.asarray(arm.pose(q))[:, :3, :3]
+        moved = np.stack([np.cross(axis, tips) for axis in np.eye(3)], axis=2)
+        free = np.concatenate([moved, np.tile(np.eye(3), (_TESTED, 1, 1)), turned], axis=2)
+        frames = _basis(free.reshape(3 * _TESTED, -1))  # of the base, and the tip
+        step = _without(frames, (np.asarray(other.position(q)) - tips).ravel())
+        by_parameters = _without(frames, np.asarray(arm.jacobian(q, names)).reshape(3 * _TESTED, -1)) * steps @ right.T
+        along, gram = step @ by_parameters / max(step @ step, 1e-300), by_parameters.T @ by_parameters / _TESTED
+        remaining = spread @ np.diag(gram)
+        error = np.einsum("stp,pq,stq->st", mean, gram, mean) + remaining
+        deviation = (mean @ along - 0.5) / np.sqrt(np.maximum(spread @ along**2, 1e-300))
+        half = student_tail(deviation, np.full(weight.shape, np.inf)) / 2
+        probability = float(np.sum(weight * np.where(deviation > 0, 1 - half, half)))
+        return cls(probability, math.sqrt(np.sum(weight * error)), math.sqrt(np.sum(weight * remaining)))
+
+
+def _with_tip(arm: Arm, fit: Linearisation) -> tuple[Arm, tuple[str, ...]]:
+    """The arm with the tip that was found, and the names of its coordinates; none where all tips are targets."""
+    if fit.space.names == _FIXED:
+        return arm, ()
+    return arm.replace(probe=np.asarray(fit.z)[: len(PROBE)]), PROBE

@@ -1,0 +1,56 @@
+"""Delivered parameters verified, and a plate with sockets made, from the command line."""
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+
+SOCKETS = {"A": (-400.0, -250.0, 100.0), "B": (-300.0, -250.0, 100.0), "C": (300.0, 350.0, 400.0)}
+
+
+@pytest.fixture
+def robot(tmp_path):
+    """A manifest of poses of an arm whose parameters are those of true.toml."""
+    nominal = aj.load_arm("ur5e").replace(probe=np.array([20.0, -40.0, 120.0]))
+    names = tuple(f"{kind}_{i}" for kind in ("a", "d", "theta", "alpha") for i in range(1, 7))
+    true = aj.perturbed_arm(aj.Parameters(nominal, names), length=0.8, angle=0.002, seed=0)
+    worse = aj.perturbed_arm(aj.Parameters(nominal, names), length=1.6, angle=0.004, seed=1)
+    for name, arm in {"nominal": nominal, "true": true, "worse": worse}.items():
+        aj.files.save_arm(arm, tmp_path / f"{name}.toml", name=name)
+    capture = aj.simulate(true, SOCKETS, poses=7, noise=aj.Noise(encoder_arcsec=5.0, seating=0.03), seed=0)
+    for name, q in capture.sockets.items():
+        header = ",".join(f"q_{i} [rad]" for i in range(1, 7))
+        np.savetxt(tmp_path / f"socket_{name}.csv", q, delimiter=",", header=header, comments="")
+    (tmp_path / "poses.toml").write_text(
+        'arm = "nominal.toml"\n[[socket]]\nname = "{socket}"\nfile = "socket_{socket}.csv"\n'
+        '[[length]]\nfrom = "A"\nto = "B"\nvalue = 100.0\nu = 0.05\n'
+    )
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_a_good_and_a_bad_delivery(aacmm, robot):
+    good = json.loads(aacmm("verify", "poses.toml", "--delivered", "true.toml", "--json").stdout)
+    assert good["verdict"] == "better"
+    assert good["accuracy"][1]["rms_mm"] < 0.1 < good["accuracy"][0]["rms_mm"]
+    assert len(good["accuracy"][1]["length_errors_mm"]) == 1
+    printed = " ".join(aacmm("verify", "poses.toml", "--delivered", "worse.toml", expect=1).stdout.split())
+    for part in ("are worse than the nominal ones", "21 poses", "2.5 % worse", "it would gain", "Real share"):
+        assert part in printed
+    assert "as_found" in aacmm("verify", "poses.toml", expect=2).stderr
+
+
+def test_a_plate_is_made_with_the_lines_of_its_manifest(aacmm, tmp_path):
+    printed = aacmm("sockets", "-o", "plate.stl", "--drawing", "plate.pdf", "--distance-mm", 80).stdout
+    assert (tmp_path / "plate.pdf").read_bytes().startswith(b"%PDF")
+    assert len((tmp_path / "plate.stl").read_bytes()) > 10_000
+    manifest = tomllib.loads(printed[printed.index("[[socket]]") :])
+    assert manifest["length"] == [{"from": "A", "to": "B", "value": 80, "u": 0.05}]
+
+
+def test_a_plate_that_cannot_be_made_is_one_sentence_and_no_file(aacmm, tmp_path):
+    assert "at least" in aacmm("sockets", "-o", "plate.stl", "--distance-mm", 5, expect=2).stderr
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,127 @@
+"""Delivered parameters tested on a handful of poses: verdicts, their error rate, what is counted, and bad input."""
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.kinematics.parameters import ArmSpecification
+from aacmm_jax.pipeline.verification import _paired, _Rows
+from aacmm_jax.summaries.verification import verification_summary
+
+PROBE = np.array([20.0, -40.0, 120.0])
+NAMES = tuple(f"{kind}_{i}" for kind in ("a", "d", "theta", "alpha") for i in range(1, 7))
+SIZES = np.repeat([0.5, 1e-3], 12)  # mm and rad
+SOCKETS = {"A": (-400.0, -250.0, 100.0), "B": (-300.0, -250.0, 100.0), "C": (300.0, 350.0, 400.0)}
+
+
+def arms(seed: int, true: float, other: float):
+    """The nominal arm, the true one, and one with ``true`` of its errors and ``other`` of another robot's."""
+    random, nominal = np.random.default_rng(seed), aj.load_arm("ur5e").replace(probe=PROBE)
+    space = aj.Parameters(nominal, NAMES)
+    own, foreign = (random.normal(size=len(NAMES)) * SIZES for _ in "ab")
+    start = np.asarray(space.vector())
+    return nominal, space.arm(start + own), space.arm(start + true * own + other * foreign)
+
+
+def recording(nominal, true, poses=8, lengths=(), sockets="ABC"):
+    noise = aj.Noise(encoder_arcsec=5.0, seating=0.03)
+    return aj.Recording(
+        aj.simulate(true, {name: SOCKETS[name] for name in sockets}, poses=poses, lengths=lengths, noise=noise, seed=1),
+        ArmSpecification(nominal, "UR5e"),
+    )
+
+
+@pytest.mark.parametrize(
+    ("true", "other", "verdict"),
+    [(1.0, 0.2, "better"), (1.0, 0.0, "better"), (-1.0, 0.0, "worse"), (0.0, 2.0, "worse"), (0.5, 0.8, "not decided")],
+)
+def test_verdicts(true, other, verdict):
+    nominal, real, delivered = arms(1, true, other)
+    checked = aj.verify(recording(nominal, real), delivered)
+    assert checked.verdict == verdict
+    assert checked.nominal.lower < checked.nominal.rms < checked.nominal.upper
+    assert (checked.verdict == "not decided") == (checked.share_lower < 0.5 < checked.share_upper)
+    if (true, other) == (1.0, 0.0):  # repeatability alone is left: seat, and encoders at arm's length
+        assert checked.delivered.rms == pytest.approx(np.sqrt(3) * 0.03, rel=0.3)
+        assert checked.share == pytest.approx(1.0, abs=0.05)
+        assert checked.volume < 0.3 * checked.nominal.rms
+
+
+def test_poses_in_one_place_do_not_decide_about_the_working_volume():
+    nominal, real, delivered = arms(1, 0.0, 1.0)
+    checked = aj.verify(recording(nominal, real, sockets="AB"), delivered)
+    assert (checked.verdict, checked.verdict_here) == ("not decided", "worse")
+    assert "Record poses in other places" in verification_summary(checked, "", "")["poses_say"]
+
+
+def test_exchanged_arms_have_the_opposite_verdict():
+    nominal, real, delivered = arms(2, 1.0, 0.3)
+    forward = aj.verify(recording(nominal, real), delivered)
+    backward = aj.verify(recording(delivered, real), nominal)
+    assert (forward.verdict, backward.verdict) == ("better", "worse")
+    assert backward.share == pytest.approx(1 - forward.share, abs=0.01)
+    assert backward.nominal.rms == pytest.approx(forward.delivered.rms)
+
+
+def test_what_is_counted():
+    """Two sockets: 3 coordinates a pose, less the tip and two positions; a length is one more equation."""
+    nominal, real, delivered = arms(3, 1.0, 0.3)
+    plain = aj.verify(recording(nominal, real, 4, (), "AB"), delivered)
+    assert (plain.poses, plain.equations, plain.unknowns) == (8, 24, 9)
+    measured = aj.verify(recording(nominal, real, 4, [aj.ReferenceLength("A", "B", 100.0, u=0.01)], "AB"), delivered)
+    assert (measured.equations, measured.unknowns) == (25, 9)
+    assert measured.length_errors.shape == (2, 1)
+    q = np.random.default_rng(0).uniform(-2, 2, (8, 6))
+    seen = aj.data.observations.MeasuredPoints("tracker", q, real.position(q) + 500.0, u=0.02, target="ball")
+    tracked = aj.verify(aj.Recording(aj.Capture({}, [], [seen]), ArmSpecification(nominal, "")), delivered)
+    assert (tracked.poses, tracked.equations, tracked.unknowns) == (8, 24, 9)
+
+
+def test_the_same_parameters_are_said_to_be_the_same():
+    nominal, real, _ = arms(4, 1.0, 0.0)
+    checked = aj.verify(recording(nominal, real), nominal)
+    assert (checked.same, checked.verdict, checked.decided_by) == (True, "not decided", None)
+
+
+def drawn(random: np.random.Generator, share: float, clusters: int = 12) -> tuple[_Rows, _Rows]:
+    """Residuals of two arms, of which the second has so much of what lies between them, with unknowns eliminated."""
+    basis = np.linalg.qr(random.normal(size=(3 * clusters, 4)))[0]
+    step, error = random.normal(size=(2, 3 * clusters))
+    error *= np.repeat(np.exp(random.normal(size=clusters) / 2), 3)  # some poses err more
+    nominal = share * step + error
+    pose = np.repeat(np.arange(clusters), 3)
+    rows = [_Rows(values - basis @ (basis.T @ values), basis, pose, clusters) for values in (nominal, nominal - step)]
+    return rows[0], rows[1]
+
+
+def test_the_standard_error_is_that_of_leaving_out_each_pose():
+    """CR3 is the jackknife of the regression, unknowns included, about the estimate of all poses."""
+    nominal, delivered = drawn(np.random.default_rng(0), 0.8)
+    step = nominal.residual - delivered.residual
+    columns = np.column_stack([step, nominal.basis])
+    shares = []
+    for pose in range(12):
+        kept = nominal.pose != pose
+        shares.append(np.linalg.lstsq(columns[kept], nominal.residual[kept], rcond=None)[0][0])
+    whole = np.linalg.lstsq(columns, nominal.residual, rcond=None)[0][0]
+    found = _paired(nominal, delivered)
+    assert found.share == pytest.approx(whole)
+    assert found.u == pytest.approx(np.sqrt(11 / 12 * np.sum((np.array(shares) - whole) ** 2)))
+
+
+def test_equally_good_parameters_are_told_apart_as_rarely_as_stated():
+    random = np.random.default_rng(1)
+    decided = [_paired(*drawn(random, 0.5)).verdict != "not decided" for _ in range(400)]
+    assert np.mean(decided) < 0.05 + 2 * np.sqrt(0.05 * 0.95 / 400)
+
+
+def test_what_cannot_be_verified():
+    nominal, real, delivered = arms(5, 1.0, 0.3)
+    recorded = recording(nominal, real)
+    with pytest.raises(aj.InputError, match="--delivered, or as_found"):
+        aj.verify(recorded)
+    with pytest.raises(aj.InputError, match="has 7 joints"):
+        aj.verify(recorded, aj.load_arm("panda"))
+    few = recorded._replace(capture=aj.Capture({"A": recorded.capture.sockets["A"][:3]}))
+    with pytest.raises(aj.InputError, match="at least four poses"):
+        aj.verify(few, delivered)
