@@ -314,7 +314,7 @@ def same_arm(first: Arm, second: Arm) -> bool:
     with a calibration."""
 
     def parameters(arm: Arm) -> Geometry:
-        plain = arm.geometry._replace(coefficients=None, gravity=None, corrections=None)
+        plain = arm.geometry._replace(coefficients=None, gravity=None, corrections=None, beside=None)
         return plain._replace(beta=np.zeros(arm.joints) if arm.beta is None else arm.beta)
 
     return jax.tree.all(jax.tree.map(np.array_equal, parameters(first), parameters(second)))

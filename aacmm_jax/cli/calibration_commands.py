@@ -227,7 +227,8 @@ def compare_models(
     models: str | None = option(
         "Models to compare, from the simplest to the most complex, separated by semicolons; each is written as for "
         "calibrate --model. Default: dh; gravity; harmonics=1; gravity,harmonics=1; functions (harmonics=1-31); "
-        "gravity,functions; if the capture contains temperatures, also each of these models with expansion.",
+        "gravity,functions; if the capture contains directions of approach, loads or temperatures, also each of these "
+        "models with backlash, load or expansion.",
         "MODELS",
     ),
     leave_out: list[str] | None = option(

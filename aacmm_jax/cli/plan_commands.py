@@ -29,7 +29,7 @@ _OF_ALL = {"arm", "output", "manifest", "base", "tip", "seed", "as_json", "angle
 _OF_CALIBRATIONS = {
     *("poses", "model", "held", "encoder_arcsec", "linear_encoder_mm", "seating_mm", "tool_axis", "retract_mm", "cell"),
     *("collisions", "link_radius_mm", "unconstrained", "criterion", "region", "candidates", "check_length_mm"),
-    "farthest",
+    *("farthest", "both_sides"),
 }
 _OF_SOCKETS = {"sockets", "socket", "length", "length_mm", "u_mm", "cone_deg", "normal"}
 _OF_ACCEPTANCE = {"acceptance", "sphere_mm", "stylus_mm", "bar_mm", "range_mm"}
@@ -138,6 +138,12 @@ def plan(
     farthest: float | None = option(
         f"Place nothing farther from the shoulder than this fraction of the reach. Default: {_FARTHEST}.", "FRACTION"
     ),
+    both_sides: bool = flag(
+        "--both-sides",
+        "Take every pose twice, with each joint moved to it from one side and then from the other, to find backlash "
+        "(--kit with instruments or cameras that leave the tip free). Copy the columns direction_1, ... to the "
+        "readings.",
+    ),
     kit: Path | None = option(
         "Plan for the artefacts and instruments in this file, with their uncertainties, instead of sockets.",
         "FILE.toml",
@@ -192,7 +198,7 @@ def plan(
         planned, stated = _planned(specification, given, links)
         summarise, view = (words.plan_summary, words.plan) if kit is None else (words.kit_plan_summary, words.kit_plan)
     with together(output, manifest):
-        write_text(output, plan_csv(planned, angles))
+        write_text(output, plan_csv(planned, angles, both_sides))
         if manifest is not None:
             # A manifest names the links with the arm; an arm file (TOML) names those of its URDF itself.
             urdf = specification.urdf if arm.lower().endswith(ROBOT_FILES) else None

@@ -335,6 +335,25 @@ def check_one_capture(capture: Capture) -> None:
         )
 
 
+def as_read_by(capture: Capture, recorded: Arm, arm: Arm) -> Capture:
+    """A capture of one arm with the columns that another one has beside the joints' readings (`Beside.laid_out`)."""
+    if recorded.joints != arm.joints or capture.columns not in recorded.possible_columns:
+        return capture
+    names = recorded.beside.names(capture.columns)
+    if arm.beside.is_clear(names):
+        return capture
+    parts = [part.changed(q=arm.beside.laid_out(np.asarray(part.q), names)) for part in capture.parts]
+    count = len(capture.names)
+    return Capture(
+        {part.name: part.q for part in parts[:count]},
+        capture.lengths,
+        parts[count:],
+        capture.repeated,
+        capture.sessions,
+        visits_of(capture),
+    )
+
+
 def check_readings(capture: Capture, arm: Arm, *, advice: str = "convert with numpy.deg2rad") -> None:
     """Raise `InputError` where known readings of an arm's revolute joints look like degrees, with advice on them."""
     for part in capture.parts:

@@ -132,6 +132,8 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
         of_joints += [_settling(term) for term in drifts] if settles else drifts
     of_joints += [named("zero", joint, np.ones_like(order), relative=True) for joint in range(1, arm.joints + 1)]
     for name, (kind, sought) in all_sought().items():
+        if kind.column and kind.column not in arm.beside.names(q.shape[1]):
+            continue
         terms = terms_of(model_with(kind, sought.option), arm.joints)
         values = function_values(arm, terms, q)
         if kind.of_arm:

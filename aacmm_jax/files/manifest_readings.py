@@ -11,13 +11,15 @@ from ..core.errors import InputError
 from ..core.text import quoted
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import check_revolutions
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, by_joint
 from ..kinematics.beside import BY_JOINT, COLUMNS
 from .manifest_files import as_list
 from .manifest_tables import Angles, PointsTable
 from .table_columns import BESIDE, LINE, header_units, position_columns, proposed_columns, reading_columns
 from .text_lines import Column
 from .text_table import TextTable
+
+_MOVED, _SLID = 2e-3, 0.1  # rad, mm: a smaller motion does not tell from which side a joint was moved
 
 
 class Wanted(NamedTuple):
@@ -66,9 +68,13 @@ class Readings:
         stated = wanted.columns
         if stated is None and self._angles is not None and self._angles.columns is not None:
             stated = as_list(self._angles.columns)
-        beside = {name: columns for name in COLUMNS if (columns := self._columns_of(text, name))}
-        by_joint = [i for name in BY_JOINT for i in beside.get(name, [])]
-        picked = reading_columns(text, self._arm.joints, [*wanted.taken, *by_joint], stated, names=self._names)
+        beside = {
+            name: columns
+            for name in COLUMNS
+            if not (name == "directions" and self._in_order) and (columns := self._columns_of(text, name))
+        }
+        of_joints = [i for name in BY_JOINT for i in beside.get(name, [])]
+        picked = reading_columns(text, self._arm.joints, [*wanted.taken, *of_joints], stated, names=self._names)
         for name, columns in beside.items():
             if set(columns) & set(picked):
                 raise InputError(
@@ -80,6 +86,8 @@ class Readings:
         q = angles.converted(numbers, self._arm)
         check_revolutions(str(text.path), q, self._arm, 'correct the header, or write unit = "deg" in [angles]')
         recorded = {name: text.numbers(columns) for name, columns in beside.items()}
+        if self._in_order:
+            recorded["directions"] = directions_of_order(q, np.array(by_joint(self._arm, _MOVED, _SLID)))
         for name, value in wanted.beside.items():
             column = stated_or_recorded(value, recorded.get(name), BESIDE[name], str(text.path), len(q))
             recorded |= {} if column is None else {name: column}
@@ -95,6 +103,10 @@ class Readings:
                 add = f"add a column {BESIDE[name]} to {without}, or state {BESIDE[name]} in its table."
             raise InputError(f"{without} has no {what}, but {other} has {what}; {add}")
         return np.hstack([q, *recorded.values()])
+
+    @property
+    def _in_order(self) -> bool:
+        return self._angles is not None and self._angles.directions == "order"
 
     def _columns_of(self, text: TextTable, name: str) -> list[int]:
         """The columns of what was recorded beside the readings: those that the manifest names, or that have the usual
@@ -141,6 +153,17 @@ class Readings:
                 f'{text.path} has readings in counts; add linear_unit = "counts" and counts_per_mm = [...].'
             )
         return Angles(**{**stated, "unit": unit})
+
+
+def directions_of_order(q: Float[np.ndarray, "N n"], least: Float[np.ndarray, " n"]) -> Float[np.ndarray, "N n"]:
+    """From which side each joint was moved to its reading, of poses in the order of recording: the sign of its last
+    motion that is larger than ``least``, since a smaller one is noise or within the play; 0 before the first."""
+    directions, turned_at = np.zeros_like(q), q[:1].copy()
+    for i in range(1, len(q)):
+        moved = np.abs(q[i] - turned_at[0]) > least
+        directions[i] = np.where(moved, np.sign(q[i] - turned_at[0]), directions[i - 1])
+        turned_at[0] = np.where(moved, q[i], turned_at[0])
+    return directions
 
 
 def stated_or_recorded(

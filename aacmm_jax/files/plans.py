@@ -4,13 +4,14 @@ import json
 import math
 import os
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
 from ..acceptance.procedure import TOUCHED, Procedure, ProcedureItem
 from ..acceptance.standards import PLANNED
+from ..core.errors import InputError
 from ..core.text import csv_text
 from ..core.units import DEG
 from ..data.observations.declared import FREE, Entry
@@ -25,6 +26,8 @@ from .outputs import write_text
 
 Angles = Literal["deg", "rad"]
 Planned = Plan | KitPlan | Procedure
+_BACK, _BACK_LINEAR = 2 * DEG, 10.0  # rad, mm: motion before a pose, which must be larger than the play
+_IN_SPACE = ("points", "transforms", "pixels")  # kinds of observations that leave the tip free
 
 
 def save_plan(path: str | os.PathLike, plan: Planned, *, angles: Angles = "deg") -> None:
@@ -50,8 +53,8 @@ def save_plan(path: str | os.PathLike, plan: Planned, *, angles: Angles = "deg")
     write_text(path, plan_csv(plan, angles))
 
 
-def plan_csv(plan: Planned, angles: Angles = "deg") -> str:
-    """The text of `save_plan`."""
+def plan_csv(plan: Planned, angles: Angles = "deg", both_sides: bool = False) -> str:
+    """The text of `save_plan`; with ``both_sides`` every pose twice, reached by each joint from opposite sides."""
     moved = above = None  # readings and tips of the approach, which has a row before and after each pose
     if isinstance(plan, Plan):
         names = list(plan.sockets)
@@ -70,7 +73,7 @@ def plan_csv(plan: Planned, angles: Angles = "deg") -> str:
         q, tips = (np.concatenate([getattr(item, kind) for item in items]) for kind in ("q", "points"))
     readings = [f"q_{i}_{unit}" for i, unit in enumerate(by_joint(plan.arm, angles, "mm"), start=1)]
     direction = [f"probe_direction_{axis}" for axis in "xyz"]
-    move = [] if moved is None else ["move"]
+    move = [] if moved is None and not both_sides else ["move"]
     rows: list[list[Any]] = [["pose", *move, *headings, "x_mm", "y_mm", "z_mm", *readings, *direction]]
     unit, digits = (DEG, 3) if angles == "deg" else (1.0, 6)
     units = np.array(by_joint(plan.arm, unit, 1.0))
@@ -82,6 +85,12 @@ def plan_csv(plan: Planned, angles: Angles = "deg") -> str:
             for tip, reading, axis in rows
         ]
 
+    if both_sides:
+        rows[0] += [f"direction_{i}" for i in range(1, plan.arm.joints + 1)]
+        for i, name, reading, tip, side in _from_both_sides(plan, q, tips):
+            (values,) = numbers(reading[None], tip[None])
+            rows.append([i + 1, name, *labels[i], *values, *(f"{sign:.0f}" for sign in side)])
+        return csv_text(rows)
     at_poses, around = numbers(q, tips), [] if moved is None or above is None else numbers(moved, above)
     for i, label in enumerate(labels):
         pose = [i + 1, *(["pose"] if move else []), *label, *at_poses[i]]
@@ -91,6 +100,28 @@ def plan_csv(plan: Planned, angles: Angles = "deg") -> str:
         before, after = ([i + 1, name, *label, *around[i]] for name in ("approach", "retract"))
         rows += [before, pose, after]
     return csv_text(rows)
+
+
+def _from_both_sides(plan: Planned, q: np.ndarray, tips: np.ndarray) -> Iterator[tuple[int, str, Any, Any, Any]]:
+    """Number of the pose, name of the move, readings, tip and directions of approach: every pose twice, with a start
+    before it, so that each joint comes to it from one side and then from the other. The sides of the joints are drawn,
+    so that play of one differs from that of another. Raises `InputError` where something holds the tip."""
+    held = (
+        [thing.name for thing in plan.observations if thing.kind not in _IN_SPACE] if isinstance(plan, KitPlan) else []
+    )
+    if held or not isinstance(plan, KitPlan):
+        what = f"'{held[0]}' is touched" if held else "the poses are in sockets or on artefacts"
+        raise InputError(
+            f"--both-sides moves every joint towards its pose from either side, which takes the tip out of what holds "
+            f"it, but {what}; plan for an instrument or camera that sees the arm (--kit)."
+        )
+    back, random = np.array(by_joint(plan.arm, _BACK, _BACK_LINEAR)), np.random.default_rng(0)
+    for i, (reading, tip) in enumerate(zip(q, tips, strict=True)):
+        sides = random.choice([-1.0, 1.0], len(reading))
+        for side in (sides, -sides):
+            start = reading - side * back
+            yield i, "approach", start, np.asarray(plan.arm.position(start)), side
+            yield i, "pose", reading, tip, side
 
 
 def _kit_poses(plan: KitPlan) -> tuple[list[list[str]], np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

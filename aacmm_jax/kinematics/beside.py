@@ -86,15 +86,17 @@ class Beside:
         found = {name: rows[part] for name, part in self.slices(rows.shape[0]).items() if part.start < part.stop}
         return Readings(rows[: self.joints], **found)
 
+    def is_clear(self, names: tuple[str, ...]) -> bool:
+        """Whether readings that have these are taken to have them."""
+        return _fitting(self, self.width(names)) == (names,)
+
     def laid_out(self, readings: Float[np.ndarray, "N columns"], names: Sequence[str]) -> Float[np.ndarray, "N others"]:
         """Readings that have these columns beside those of the joints, as an arm takes them: without what it does not
         have, and with what changes nothing (0, 20 C) where its columns would not be clear otherwise."""
         slices = Beside(self.joints, tuple(names), tuple(names)).slices(readings.shape[1])
         kept = tuple(name for name in self.possible if name in names)
         without = tuple(name for name in self.possible if name != "torques" or name in names)
-        chosen = next(
-            choice for choice in (kept, without, self.possible) if _fitting(self, self.width(choice)) == (choice,)
-        )
+        chosen = next(filter(self.is_clear, (kept, without, self.possible)))
         columns = [readings[:, : self.joints]]
         for name in chosen:
             neutral = np.full((len(readings), self.width([name]) - self.joints), _NEUTRAL.get(name, 0.0))

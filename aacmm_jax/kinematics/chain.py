@@ -113,7 +113,7 @@ class KnownFunctions:
     @cached_property
     def columns(self) -> frozenset[str]:
         """Which of `beside.COLUMNS` the functions read."""
-        return frozenset(term.kind.column for term in self.terms if term.kind.column)
+        return frozenset(term.kind.column_of(term) for term in self.terms) - {""}
 
     @property
     def expands(self) -> bool:

@@ -13,8 +13,9 @@ from ..core.numpy_or_jax import namespace, to_numpy
 from .arm import DOWN, Arm, correction_names, is_single, joint_limits, without_corrections
 from .beside import ALL, Beside
 from .chain import Corrections, Geometry, KnownFunctions, forward_pass, joint_motion, joints_first
-from .correction_kinds import KILO, Loads, Term, Torque
+from .correction_kinds import KILO, Loads, Term
 from .corrections import term_of, terms_of
+from .recorded_kinds import Torque
 
 _CONFIGURATIONS = 300
 _INDEPENDENT = 1e-6  # of a function's size: what must be left of it beside the constant and those before it
@@ -68,7 +69,7 @@ def with_corrections(
         for name, term in by_name.items():
             if term is None:
                 raise InputError(f"'{name}' is not the name of a coefficient; give a name such as cos1_2, or a model.")
-            if term.kind.rows == 3 and not term.number and loads is None:
+            if term.takes_masses and term.kind.rows == 3 and loads is None:
                 raise InputError(
                     f"'{name}' needs the masses of the links; give mass and centre, or name one of a link."
                 )

@@ -23,7 +23,7 @@ from .chain import ForwardPass, frame_axes
 
 REFERENCE_TEMPERATURE = 20.0  # C, by ISO 1
 _HIGHEST = 99  # order of a harmonic
-_STANDARD_GRAVITY = 9.80665  # m/s^2, by definition
+STANDARD_GRAVITY = 9.80665  # m/s^2, by definition
 _METRE = 1e-3  # m/mm
 KILO = 1e-3  # kN/N: with rad/(kN m), compliances are about as large as errors of angles
 _MASSES = "masses"
@@ -65,6 +65,7 @@ class AbstractCorrection(abc.ABC):
     of_own_reading: ClassVar[bool] = False  # whether each function is of its joint's reading alone, and can be drawn
     of_other_reading: ClassVar[bool] = False  # whether each function is the reading of the joint that `Term.number` is
     column: ClassVar[str] = ""  # which of `beside.COLUMNS` its functions read, where it was recorded
+    of_masses: ClassVar[bool] = False  # whether functions without a number need the masses of the links
     has_options: ClassVar[bool] = False  # whether a model may say more of it, as harmonics=1-3 does
     sought: ClassVar[tuple[Sought, ...]] = ()  # what residuals of a calibration without it are searched for
     shared: ClassVar[str | None] = None  # option of the model whose functions poses may share errors by; None: none
@@ -84,6 +85,10 @@ class AbstractCorrection(abc.ABC):
     def usual(self, terms: Sequence["Term"]) -> dict[str, float]:
         """The groups of the default prior with their standard deviations, for an arm with these terms of this kind."""
         return {self.model: self.usual_size}
+
+    def column_of(self, term: "Term") -> str:
+        """Which of `beside.COLUMNS` the function of a term reads; empty for none."""
+        return self.column
 
     @abc.abstractmethod
     def values(self, terms: Sequence["Term"], q: Readings, forward: ForwardPass) -> Rows:
@@ -108,7 +113,7 @@ class Term(NamedTuple):
     @property
     def takes_masses(self) -> bool:
         """Whether its function is computed with the masses of all links, if they are known."""
-        return not self.number and (self.kind.rows == 3 or self.kind.column == "torques")
+        return self.kind.of_masses and not self.number
 
     @property
     def unit(self) -> str:
@@ -271,6 +276,7 @@ class Gravity(AbstractCorrection):
     usual_size = 1e-3  # 1 mrad for links with levers of 1 m
     usual_of_slide = 0.05
     rows = 3
+    of_masses = True
     has_options = True
     sought = (Sought("gravity", "", "gravity about joint {i}", "a joint or link that bends under its load"),)
     shared = ""
@@ -312,59 +318,6 @@ class Gravity(AbstractCorrection):
         assert term.loads is not None
         # A link's centre of mass is at its origin, and along its axes by the coordinates that are stated.
         links, axes, centre = range(term.joint - 1, len(forward.origin)), frame_axes(forward), term.loads.centre
-        weights = {j: KILO * _STANDARD_GRAVITY * term.loads.mass[j] for j in links}
+        weights = {j: KILO * STANDARD_GRAVITY * term.loads.mass[j] for j in links}
         pulls = [weights[j] * (forward.origin[j] + sum(centre[j][k] * axes[k][j] for k in range(3))) for j in links]
         return sum(weights.values()), functools.reduce(operator.add, pulls)
-
-
-class Expansion(AbstractCorrection):
-    """The difference of the thermometer from 20 C, 0 for readings without one: all lengths, and the travel of
-    carriages, grow by it times one coefficient (steel 11.5e-6 / K, aluminium 23e-6, carbon fibre along it 1e-6)."""
-
-    model = "expansion"
-    words = ("expansion",)
-    description = "thermal expansion of all lengths"
-    unit = "1/K"
-    usual_size = 2e-5
-    of_arm = True
-    column = "thermometer"
-    sought = (Sought("thermal expansion", "", "temperature", "an arm that expands"),)
-
-    def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
-        return (Term(self, "expansion", 0, 0),)
-
-    def wrong(self, term: Term, joints: int) -> str:
-        return "applies to the whole arm, so its name must have no number" if term.number or term.joint else ""
-
-    def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
-        return 0.0 * q.joints[:1] if q.thermometer is None else q.thermometer - REFERENCE_TEMPERATURE
-
-
-class Torque(AbstractCorrection):
-    """Compliance: a joint yields to the torque of its drive, which was recorded beside its reading, N m (N of a slide).
-
-    Unlike `Gravity`, this holds for whatever loads the joint: a tool, a cable, a process. Drives carry the arm, so that
-    torques have the sign of what holds it against gravity. Where none were recorded, as for poses that are planned,
-    simulated or commanded, they are those that hold masses that are known, in a base that stands upright; without
-    masses they are 0.
-    """
-
-    model = "torque"
-    words = ("torque",)
-    description = "joint compliances under measured torques"
-    unit = "rad/(kN m)"
-    usual_size = 1e-2  # 1 mrad for 100 N m
-    usual_of_slide = 0.5
-    column = "torques"
-
-    def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
-        return tuple(Term(self, "torque", 0, joint, loads) for joint in range(1, joints + 1))
-
-    def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
-        numbers = np.array([term.joint - 1 for term in terms])
-        if q.torques is not None:
-            return KILO * q.torques[numbers]
-        if terms[0].loads is None:
-            return 0.0 * q.joints[numbers]
-        # Gravity points along -z: what holds the arm has the opposite sign, that of the moments' last component.
-        return Gravity().values(terms, q, forward)[2::3]

@@ -5,18 +5,8 @@ from collections.abc import Iterable
 from functools import lru_cache
 
 from ..core.errors import InputError, nearest
-from .correction_kinds import (
-    AbstractCorrection,
-    Coupling,
-    Expansion,
-    GearRatio,
-    Gravity,
-    Harmonics,
-    Loads,
-    Sought,
-    Term,
-    Torque,
-)
+from .correction_kinds import AbstractCorrection, Coupling, GearRatio, Gravity, Harmonics, Loads, Sought, Term
+from .recorded_kinds import Backlash, Expansion, Load, Torque
 
 # Short forms. An error function of each joint, whatever its cause: with a prior, 62 coefficients a joint are few enough
 # to be found in seconds from 500 poses, and orders to 63 were hardly better (`benchmarks/NOTES.md`).
@@ -25,7 +15,8 @@ _COEFFICIENT = re.compile(r"([a-z]+)([1-9][0-9]*)?(?:_([1-9][0-9]*))?")
 _KEPT = 4096  # results: every calibration asks for the same ones
 
 KINDS: dict[str, AbstractCorrection] = {  # by what a model calls them, in the order of these names
-    kind.model: kind for kind in (Coupling(), Expansion(), GearRatio(), Gravity(), Harmonics(), Torque())
+    kind.model: kind
+    for kind in (Backlash(), Coupling(), Expansion(), GearRatio(), Gravity(), Harmonics(), Load(), Torque())
 }
 
 

@@ -30,7 +30,7 @@ from ..core.arguments import NotNegative, OneOf, checked_arguments, with_options
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import listed, shorten
-from ..data.capture import Capture
+from ..data.capture import Capture, as_read_by
 from ..data.recording import Recording
 from ..diagnostics.findings import findings_of, sentences
 from ..diagnostics.usability import why_unusable
@@ -112,9 +112,9 @@ def evaluate_capture(record: CalibrationRecord, recording: Recording, **options:
     """
     chosen = EvaluationOptions(**options)
     used = {row.tobytes() for row in np.asarray(record.recording.capture.readings)}
-    capture, corrected = with_readings_of_arm(
-        record, recording.capture.select(chosen.only, chosen.without), recording.stated
-    )
+    capture = recording.capture.select(chosen.only, chosen.without)
+    capture = as_read_by(capture, recording.nominal.arm, record.calibrated.arm)
+    capture, corrected = with_readings_of_arm(record, capture, recording.stated)
     uncertainty = uncertainty_of(record)
     if chosen.keep:
         uncertainty = replace(uncertainty, kept=_kept(record, uncertainty, capture, chosen.keep))

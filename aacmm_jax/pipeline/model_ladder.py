@@ -43,6 +43,7 @@ _EXPECTED_VARIANCE = 9.0  # of a log variance that is expected
 _SMALL = 1e-9  # singular value, relative to the largest
 _EVIDENCE = 3.0  # of a log evidence: 20 times as probable, from which evidence is "strong" (Kass and Raftery)
 DEFAULT_MODELS = ("dh", "gravity", "harmonics=1", "gravity,harmonics=1", "functions", "gravity,functions")
+_BY_COLUMN = {"directions": "backlash", "load": "load", "thermometer": "expansion"}
 
 
 class ComparedModel(NamedTuple):
@@ -128,17 +129,17 @@ class ComparedModels(NamedTuple):
 
 def default_models(arm: Arm, capture: Capture) -> tuple[str, ...]:
     """`DEFAULT_MODELS`; where the capture has torques, those of gravity also with torques in its place, and where it
-    has temperatures, each of them also with thermal expansion."""
+    has directions of approach, loads or temperatures, each of them also with what these may show."""
     recorded = arm.beside.names(capture.columns)
     models: list[str] = []
     for model in DEFAULT_MODELS:
         if "torques" in recorded and "gravity" in model:
             models.append(model.replace("gravity", "torque"))
         models.append(model)
-    if "thermometer" not in recorded:
-        return tuple(models)
-    warmed = ((model, "expansion" if model == "dh" else f"{model},expansion") for model in models)
-    return tuple(model for pair in warmed for model in pair)
+    for column, kind in _BY_COLUMN.items():
+        if column in recorded:
+            models = [each for model in models for each in (model, kind if model == "dh" else f"{model},{kind}")]
+    return tuple(models)
 
 
 @checked_arguments

@@ -15,7 +15,7 @@ from ..kinematics.arm import Arm, is_single, jacobian_at, joint_limits
 from ..kinematics.chain import reading_units
 from ..kinematics.collisions import Cell, HalfSpace
 from ..kinematics.corrected_arm import loads_of
-from ..kinematics.correction_kinds import Expansion, Torque
+from ..kinematics.corrections import coefficient_of
 from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import (
     TOOL_AXIS,
@@ -143,9 +143,10 @@ class DesignProblem(NamedTuple):
             raise InputError("a plan needs a single arm, but this is a batch; select one arm of the batch.")
         options = checked_fields(options)
         space = Parameters.free_of(arm) if options.space is None else options.space
-        # Plans are at 20 C, so they say nothing of thermal expansion, and without masses their torques are unknown.
-        kinds = (Expansion,) if arm.corrections is None or loads_of(arm) else (Expansion, Torque)
-        planned = tuple(name for name in space.names if name.split("_")[0] not in [kind.words[0] for kind in kinds])
+        # What is recorded beside readings is not known of planned poses, but for the torques of known masses.
+        known = "torques" if arm.corrections is not None and loads_of(arm) else ""
+        columns = {name: term.kind.column_of(term) for name in space.names if (term := coefficient_of(name))}
+        planned = tuple(name for name in space.names if columns.get(name, "") in ("", known))
         space = to_numpy(Parameters(space.base, planned))
         if arm.beta is None and space.base.beta is not None:  # free, and 0 so far
             arm = arm.replace(beta=np.zeros(arm.joints))

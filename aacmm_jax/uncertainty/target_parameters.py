@@ -7,8 +7,8 @@ from ..data.capture import Capture
 from ..data.observations.measured import MeasuredTransforms
 from ..data.observations.observation import offset_of
 from ..kinematics.arm import Arm, correction_names, parameter_names
-from ..kinematics.correction_kinds import Expansion
 from ..kinematics.parameters import Parameters
+from ..kinematics.recorded_kinds import Expansion
 from ..model.observed import Observed
 
 # C, range of the temperatures below which a capture says less of the expansion than the material does: 80 poses over a

@@ -98,6 +98,31 @@ def test_torques(tmp_path, motion):
             read(tmp_path, text)
 
 
+def test_directions_and_loads(tmp_path, motion):
+    """Recorded, named, or by the order of the rows; a load for every row, or one for the table."""
+    sides = np.tile([1.0, -1.0, 0.0, 1.0], (6, 1)).T
+    usual = ",".join(f"direction_{i}" for i in range(1, 7))
+    record(
+        tmp_path / "a.csv",
+        np.column_stack([motion, sides, [0, 1, 2, 3]]),
+        header=f"q1,q2,q3,q4,q5,q6,{usual},load_kg\n",
+    )
+    socket = '[[socket]]\nfile = "a.csv"\n'
+    expected = np.column_stack([motion, sides, [0, 1, 2, 3]])
+    np.testing.assert_array_equal(read(tmp_path, HEAD + ANGLES + socket).sockets["a"], expected)
+    assert aj.files.read_manifest(tmp_path / "capture.toml").nominal.arm.recorded == ("directions", "load")
+    rises, stays, falls = 0.5, 0.501, 0.2  # a joint that hardly moves stays on its side
+    record(
+        tmp_path / "b.csv", np.add.outer([0.0, rises, stays, falls], 0.1 * np.arange(6)), header="q1,q2,q3,q4,q5,q6\n"
+    )
+    ordered = HEAD + ANGLES + 'directions = "order"\n[[socket]]\nfile = "b.csv"\nload_kg = 2.5\n'
+    found = read(tmp_path, ordered).sockets["b"]
+    np.testing.assert_array_equal(found[:, 6:], np.repeat([[0, 2.5], [1, 2.5], [1, 2.5], [-1, 2.5]], [6, 1], axis=1))
+    record(tmp_path / "c.csv", np.column_stack([motion, 2 * sides]), header=f"q1,q2,q3,q4,q5,q6,{usual}\n")
+    with pytest.raises(aj.InputError, match="socket 'c' pose 1 has the direction 2 of joint 1; give 1 where"):
+        read(tmp_path, HEAD + ANGLES + socket.replace("a.csv", "c.csv"))
+
+
 def test_visits_of_sessions_and_targets(tmp_path, motion):
     """Each file is a visit, in sessions too; of a socket with another tip than the probe they are refused."""
     record(tmp_path / "b.csv", motion + 0.1)

@@ -84,3 +84,25 @@ def test_a_target_that_is_hardly_ever_seen_is_refused():
     item = camera(True, distance=(4000, 4100))
     problem = DesignProblem.of(ARM, aj.planning.PlanOptions(space=SPACE))
     assert_refused(lambda: set_up(problem.region, Thing(KitItem(item, 0), item), 200), "'images'", "move the target")
+
+
+def test_poses_from_both_sides(planned):
+    """Every pose twice: each joint comes from one side and then from the other, as its columns say."""
+    rows = [line.split(",") for line in plan_csv(planned, "rad", both_sides=True).splitlines()]
+    assert rows[0][1] == "move"
+    assert rows[0][-6:] == [f"direction_{i}" for i in range(1, 7)]
+    assert len(rows) == 1 + 4 * 8
+    first = rows[0].index("q_1_rad")
+    for start, pose, back, again in zip(*(rows[1 + i :: 4] for i in range(4)), strict=True):
+        assert [row[1] for row in (start, pose, back, again)] == ["approach", "pose"] * 2
+        assert pose[first : first + 6] == again[first : first + 6]
+        for before, there, sign in ((start, pose, 1), (back, again, -1)):
+            moved = np.array(there[first : first + 6], float) - np.array(before[first : first + 6], float)
+            np.testing.assert_allclose(moved, np.radians(2) * np.array(there[-6:], float), atol=2e-6)
+            np.testing.assert_array_equal(np.array(there[-6:], float), sign * np.array(pose[-6:], float))
+
+
+def test_both_sides_need_a_tip_that_nothing_holds(planned):
+    held = planned._replace(observations=(aj.data.observations.Socket("seat", np.zeros((1, 6))),))
+    with pytest.raises(aj.InputError, match="'seat' is touched; plan for an instrument or camera"):
+        plan_csv(held, both_sides=True)
