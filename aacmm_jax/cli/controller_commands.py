@@ -21,6 +21,7 @@ from .options import argument, flag, names_option, numbers_option, option, outpu
 _ROBOTS = ("urdf", "mjcf")
 _FORMATS = {".urdf": "urdf", ".xml": "mjcf", ".json": "json", ".csv": "csv", ".py": "python"}
 _FORMATS |= dict.fromkeys((".yaml", ".yml"), "ur")
+_ZEROS = {"lerobot": "--file CALIBRATION.json", "kuka": "--file MACHINE.DAT", "ros-calibration": ""}
 _OF_CAMERA = ("camera-info", "joint-origin", "static-transform", "opencv", "matrix")
 _OF_ONE_ARM = ("toml", *_ROBOTS, "table", "ur", "python")
 
@@ -51,6 +52,9 @@ def export(
         "static-transform",
         "opencv",
         "matrix",
+        "lerobot",
+        "kuka",
+        "ros-calibration",
     ]
     | None = option(
         "toml: arm file; json: complete summary; csv: parameters; dcc: Digital Calibration Certificate (XML); urdf, "
@@ -58,7 +62,9 @@ def export(
         "refitted zero offsets of the joints only; ur: kinematics.yaml of Universal Robots; python: a program that "
         "needs only NumPy; "
         "camera-info: intrinsics of a camera (ROS, YAML); joint-origin, static-transform, opencv, matrix: frame of a "
-        "camera or target, as the fixed joint of a URDF, a command of ROS 2, YAML of OpenCV, or 4 x 4 matrix (mm). "
+        "camera or target, as the fixed joint of a URDF, a command of ROS 2, YAML of OpenCV, or 4 x 4 matrix (mm); "
+        "lerobot, kuka, ros-calibration: zero offsets of the joints only, in LeRobot's calibration file, in KUKA's "
+        "$machine.dat ($MAMES), or as <calibration> in the URDF. "
         "Default: the format of the output's extension (.urdf, .xml, .json, .csv, .yaml, .py), otherwise toml.",
         "FORMAT",
         "--format",
@@ -77,6 +83,14 @@ def export(
     frame: Literal["mount", "place"] | None = option(
         "Frame to write with the formats of frames: mount: what is on the arm (camera or target), in the flange or in "
         "the tip link of the URDF; place: what stands still, in the base. Default: mount."
+    ),
+    file: Path | None = option(
+        "File of the controller to take over with other zero offsets (--format lerobot or kuka).", "FILE"
+    ),
+    motors: str | None = option(
+        "Motor (lerobot) or number of the axis (kuka) of each joint, separated by commas, with a minus before one that "
+        "counts against the joint, or that adds its offset, as Dynamixel motors do. Default: in the order of the file.",
+        "NAMES",
     ),
     output: Path | None = output("File to write. Default: standard output.", "FILE", None),
     about: Path | None = options.ABOUT,
@@ -101,6 +115,9 @@ def export(
         raise InputError(f"--camera and --frame apply to cameras only; give --format {', '.join(_OF_CAMERA)} too.")
     if frame is not None and written_as == "camera-info":
         raise InputError("--frame does not apply to --format camera-info; leave it out.")
+    if (file is not None) != bool(_ZEROS.get(written_as)) or (motors is not None and file is None):
+        asked = ", ".join(f"--format {name} {how}" for name, how in _ZEROS.items() if how)
+        raise InputError(f"--file is needed for these formats, and --motors and --file apply to no others: {asked}.")
     notes: list[str] = []
     with together(output):
         record = files.load_calibration(read := InputFile(calibration))
@@ -125,6 +142,8 @@ def export(
             notes = _left_out_of_table(record, specification.arm)
         elif written_as in _OF_CAMERA:
             text = _of_camera(record, written_as, camera, frame or "mount")
+        elif written_as in _ZEROS:
+            text, notes = _zeros_in_file(record, written_as, file, motors)
         elif written_as in _ROBOTS:
             text, notes = _urdf(record, specification, written_as)
         else:
@@ -148,8 +167,7 @@ def _text(record: Any, specification: Any, form: str, calibrated: bool) -> str:
     if form == "ur":
         return files.ur_kinematics_yaml(specification.arm)
     if form == "offsets":
-        readings = np.asarray(capture.readings)[:, : nominal.arm.joints]
-        return files.zero_offsets_csv(files.zero_offsets(nominal.arm, record.calibrated.arm, readings))
+        return files.zero_offsets_csv(_zero_offsets(record))
     scale = "" if math.isnan(record.k) else f", k = {record.k:.8f}"
     source = f"calibrated from {len(capture.readings)} poses, {record.method}{scale}" if calibrated else ""
     if form == "toml":
@@ -158,6 +176,29 @@ def _text(record: Any, specification: Any, form: str, calibrated: bool) -> str:
         return specification_toml(specification, source=source)
     title = ", ".join(part for part in (specification.name, source) if part)
     return files.python_program(specification.arm, title=title, base=first_frame(nominal))
+
+
+def _zero_offsets(record: Any) -> files.ZeroOffsets:
+    nominal = record.recording.nominal.arm
+    readings = np.asarray(record.recording.capture.readings)[:, : nominal.joints]
+    return files.zero_offsets(nominal, record.calibrated.arm, readings)
+
+
+def _zeros_in_file(record: Any, form: str, file: Path | None, motors: str | None) -> tuple[str, list[str]]:
+    """A controller's file with the zero offsets, and what they leave."""
+    zeros, source = _zero_offsets(record), record.recording.nominal.urdf
+    if file is None:
+        if source is None:
+            raise InputError(f"the nominal arm was not read from a URDF, which --format {form} needs; choose offsets.")
+        written = files.ros_calibration(source, zeros)
+    else:
+        change = files.lerobot_calibration if form == "lerobot" else files.kuka_machine_data
+        written = change(InputFile(file), zeros, None if motors is None else names_option(motors))
+    return written.text, [
+        f"With these zero offsets, the tips of the nominal and the calibrated arm differ by {zeros.rms:.4f} mm RMS "
+        f"({zeros.rms_nominal:.4f} mm without).",
+        *written.notes,
+    ]
 
 
 def _of_camera(record: Any, form: str, named: str | None, frame: str) -> str:
@@ -249,6 +290,7 @@ def _certificate(calibration: InputFile, record: Any, about: Path | None, evalua
 
 @command(
     "aacmm correct calibration.h5 poses.csv -o corrected.csv --unit deg",
+    "aacmm correct calibration.h5 points.csv -o commanded.csv --unit deg --near 0,-90,90,0,90,0 --write poses",
     "aacmm correct calibration.h5 poses.csv -o corrected.csv --unit deg --near 0,-90,90,0,90,0 --probe 0,0,150",
 )
 def correct(
@@ -287,9 +329,14 @@ def correct(
         "temperature_C of the table.",
         "C",
     ),
+    write: Literal["readings", "poses"] = option(
+        "What to write: corrected joint readings, or, for a controller that takes poses only, the corrected poses to "
+        "command, in the units and columns of the table.",
+        default="readings",
+    ),
     as_json: bool = options.JSON,
 ) -> None:
-    """Turn commanded poses into corrected joint readings.
+    """Turn commanded poses into corrected joint readings, or into corrected poses.
 
     A controller that uses the nominal parameters expects the tip in the pose that the nominal arm has at the commanded
     joint readings. The corrected readings bring the tip of the calibrated arm to this pose. The nominal and the
@@ -304,9 +351,13 @@ def correct(
     The output table has the columns and the unit of the input table. If the pose of a row cannot be reached within the
     joint limits of the nominal arm, its readings are left empty and the exit code is 1. Do not send an arm to such a
     pose.
+
+    A table of positions without orientations needs --near; the tool keeps the orientation that the nominal arm has at
+    these readings. Corrected poses (--write poses) hold for a controller that computes joint readings with the nominal
+    parameters and in the configuration (elbow, wrist) of the readings given.
     """
     from ..core.numpy_or_jax import to_numpy
-    from ..files.table_columns import corrected_csv, read_poses
+    from ..files.table_columns import corrected_csv, corrected_poses_csv, read_poses
 
     begin = None if near is None else numbers_option("--near", near, "Q1,Q2,... with one reading per joint")
     picked = None if columns is None else [int(x) if x.isdecimal() else x for x in names_option(columns)]
@@ -320,11 +371,18 @@ def correct(
             InputFile(poses), nominal, unit=unit, near=begin, columns=picked, length_unit=length_unit
         )
         q = _at_temperature(commanded, calibrated, temperature)
-        if commanded.poses is None:
-            corrected = kinematics.corrected_readings(nominal, calibrated, q)
+        meant = np.array(nominal.pose(q[:, : nominal.joints]))
+        oriented = commanded.oriented or commanded.poses is None
+        targets = meant if commanded.poses is None else in_first_frame(record, commanded.poses)
+        targets[:, :3, :3] = targets[:, :3, :3] if oriented else meant[:, :3, :3]
+        if write == "poses":
+            to_command, corrected = kinematics.corrected_targets(nominal, calibrated, q, targets, oriented=oriented)
+            base = first_frame(record.recording.nominal)
+            in_file = to_command if base is None else base @ to_command
+            text = corrected_poses_csv(commanded, in_file, np.asarray(corrected.reached))
         else:
-            targets = in_first_frame(record, commanded.poses)
             corrected = kinematics.readings_at_poses(calibrated, q, targets, nominal.limits)
+            text = corrected_csv(commanded, np.asarray(corrected.q), np.asarray(corrected.reached))
         summary = summaries.correction.correction_summary(
             nominal, calibrated, q, corrected, unit=commanded.unit, of_readings=commanded.poses is None
         )
@@ -334,7 +392,7 @@ def correct(
                 "The arm was calibrated without thermal expansion, so the column temperature_C has no effect; "
                 "calibrate with --model expansion to correct for temperature."
             )
-        write_text(output, corrected_csv(commanded, np.asarray(corrected.q), np.asarray(corrected.reached)))
+        write_text(output, text)
         summary["written"] = str(output)
     warn_of_unusable(calibration, record)
     show_summary(summary, as_json, summaries.correction.corrections)

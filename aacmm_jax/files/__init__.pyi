@@ -14,6 +14,7 @@ from .captures import save_capture as save_capture
 from .cells import load_cell as load_cell
 from .comparisons import load_comparison as load_comparison
 from .comparisons import save_comparison as save_comparison
+from .controllers import ZeroOffsets as ZeroOffsets
 from .controllers import dh_table as dh_table
 from .controllers import python_program as python_program
 from .controllers import ur_kinematics_yaml as ur_kinematics_yaml
@@ -31,3 +32,6 @@ from .urdf import link_masses as link_masses
 from .urdf import save_urdf as save_urdf
 from .urdf import urdf_chain as urdf_chain
 from .urdf import urdf_of as urdf_of
+from .zero_offset_files import kuka_machine_data as kuka_machine_data
+from .zero_offset_files import lerobot_calibration as lerobot_calibration
+from .zero_offset_files import ros_calibration as ros_calibration

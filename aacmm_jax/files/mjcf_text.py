@@ -86,6 +86,7 @@ class _Reader:
                 f"{settings['eulerseq'].where} has eulerseq = {quoted(self._sequence)}; give three of x, y, z, X, Y, Z."
             )
         self._defaults: dict[str, dict[str, dict[str, str]]] = {"main": {"joint": {}, "site": {}}}
+        self._bodies = {"world", *_body_names(document.root)}
         self._joints: dict[str, UrdfJoint] = {}
         self._links: dict[str, UrdfLink] = {"world": UrdfLink()}
         of_root = document.root.children
@@ -240,7 +241,7 @@ class _Reader:
     def _new_link(self, element: Element) -> str:
         """The name of the link of a body or site."""
         name = element.text("name") if "name" in element.attributes else ""
-        if element.name == "site" and (not name or name in self._links):  # sites have names of their own
+        if element.name == "site" and (not name or name in self._bodies):  # sites have names of their own
             name = unused_name(f"{name} (site)" if name else f"site in line {element.line}", self._links)
         elif not name:
             name = unused_name(f"body in line {element.line}", self._links)
@@ -266,6 +267,12 @@ class _Reader:
             raise InputError(f"{element.where} occurs twice; rename one of the two.")
         name = unused_name(name, self._joints)
         self._joints[name] = UrdfJoint(name, kind, parent, child, origin, axis, limits, None, element, place)
+
+
+def _body_names(element: Element) -> Iterator[str]:
+    for child in element.children:
+        yield from [child.attributes.get("name", "")] if child.name == "body" else []
+        yield from _body_names(child)
 
 
 def shift(vector: Float[np.ndarray, " 3"]) -> Transform:

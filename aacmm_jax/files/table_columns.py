@@ -241,7 +241,8 @@ def read_poses(
     q_1_deg, if the header states it), or in all columns of a table without such names, or in ``columns``. Or positions
     and orientations: x, y, z (mm, or the header's unit; or px, py, pz) with qw, qx, qy, qz (quaternion) or rx, ry, rz
     (rotation vector, in ``unit`` unless the header says it), and the readings to begin with in columns as above, or
-    ``near``. A column temperature_C is the arm's.
+    ``near``; with ``near`` also positions alone, whose orientation the caller chooses. A column temperature_C
+    is the arm's.
 
     Of poses that were ``recorded``: joint readings, and the position of the tip, perhaps with its orientation; without
     positions all poses are of one socket, or of those that a column ``socket`` names. A table without header has a
@@ -257,7 +258,8 @@ def read_poses(
         picked, after = list(range(joints)), list(range(joints, table.width))
         position = (after, None) if after else None
     else:
-        required, taken = recorded or orientation is None, position[0] if position else ()
+        taken = position[0] if position else ()
+        required = recorded or (orientation is None and (near is None or position is None))
         picked = reading_columns(table, joints, taken, columns, line="--columns {}", required=required)
     header, linear = header_units(table, picked, arm, unit) if picked else (None, None)
     if linear not in (None, "mm"):
@@ -282,7 +284,7 @@ def read_poses(
     if unit is None:
         raise InputError(f"{path} does not state the unit of the joint readings; give --unit deg or --unit rad.")
     poses = None
-    if orientation is not None or (recorded and position is not None):
+    if orientation is not None or ((recorded or near is not None) and position is not None):
         poses = _poses(table, _ANGLES[unit], position, orientation or ([], None), length_unit)
     return PoseTable(
         np.array(by_joint(arm, _ANGLES[unit], 1.0)) * readings,
@@ -303,18 +305,52 @@ def corrected_csv(commanded: PoseTable, q: Float[np.ndarray, "N n"], reached: Bo
 
     The readings (rad and mm) of rows that are not ``reached`` are left empty, so that no arm is sent there.
     """
-    table, arm = commanded.table, commanded.arm
-    rows = (q / np.array(by_joint(arm, _ANGLES[commanded.unit], 1.0))).T
-    cells = [[repr(float(x)) if good else "" for x, good in zip(row, reached, strict=True)] for row in rows]
-    names = [f"q_{i}_{unit}" for i, unit in enumerate(by_joint(arm, commanded.unit, "mm"), start=1)]
-    header, joint_of = table.header, {column: i for i, column in enumerate(commanded.columns)}
+    units = np.array(by_joint(commanded.arm, _ANGLES[commanded.unit], 1.0))
+    names = [f"q_{i}_{unit}" for i, unit in enumerate(by_joint(commanded.arm, commanded.unit, "mm"), start=1)]
+    return _with_columns(commanded.table, commanded.columns, names, q / units, reached)
+
+
+def corrected_poses_csv(
+    commanded: PoseTable, poses: Float[np.ndarray, "N 4 4"], reached: Bool[np.ndarray, " N"]
+) -> str:
+    """The table with corrected poses (mm, in the frame of the file) in place of those commanded, or after the other
+    columns: positions, and orientations unless the table has positions alone; as `corrected_csv`."""
+    from scipy.spatial.transform import Rotation
+
+    table, unit = commanded.table, commanded.unit
+    position, quaternion, vector = position_columns(table), find_named(table, _QUATERNION), None
+    columns, names = ([], ["x_mm", "y_mm", "z_mm"]) if position is None else (position[0], [])
+    values = poses[:, :3, 3] / LENGTH_UNITS["mm" if position is None else commanded.length_unit]
+    turns = Rotation.from_matrix(poses[:, :3, :3])
+    if quaternion is not None:
+        columns, values = [*columns, *quaternion[0]], np.hstack([values, turns.as_quat(scalar_first=True)])
+    elif commanded.oriented or commanded.poses is None:
+        vector = find_named(table, _ROTATION, tuple(_ANGLES))
+        stated = unit if vector is None or vector[1] is None else vector[1]
+        columns, names = [*columns, *(vector[0] if vector else [])], names + [f"{name}_{unit}" for name in _ROTATION]
+        values = np.hstack([values, turns.as_rotvec() / _ANGLES[stated]])
+    return _with_columns(table, columns, names, values, reached)
+
+
+def _with_columns(
+    table: TextTable,
+    picked: Sequence[int],
+    names: Sequence[str],
+    values: Float[np.ndarray, "N k"],
+    reached: Bool[np.ndarray, " N"],
+) -> str:
+    """The table with values in the ``picked`` columns, and those that are more than these after the others.
+
+    ``names`` are of columns that the table does not name; those of rows that are not ``reached`` are empty.
+    """
+    cells = [[repr(float(x)) if good else "" for x, good in zip(row, reached, strict=True)] for row in values.T]
+    header, place_of = table.header, {column: i for i, column in enumerate(picked)}
     columns: list[tuple[str, Sequence[str]]] = []
     for i in range(table.width):
-        joint = joint_of.get(i)
-        name = header[i] if header else f"column_{i + 1}" if joint is None else names[joint]
-        columns.append((name, list(table.texts(i + 1)) if joint is None else cells[joint]))
-    if not commanded.columns:
-        columns += zip(names, cells, strict=True)
+        place = place_of.get(i)
+        name = header[i] if header else f"column_{i + 1}" if place is None else names[place]
+        columns.append((name, list(table.texts(i + 1)) if place is None else cells[place]))
+    columns += zip(names[len(names) - (len(cells) - len(picked)) :], cells[len(picked) :], strict=True)
     return csv_text([[name for name, _ in columns], *zip(*(column for _, column in columns), strict=True)])
 
 

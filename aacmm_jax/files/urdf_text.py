@@ -23,13 +23,14 @@ _ZERO = (0.0, 0.0, 0.0)
 URDF = Format("a URDF", "robot", {
     "robot": Names("", "", "joint link", others=True),
     "link": Names("name", "inertial", "collision origin", others=True),  # an origin there means nothing
-    "joint": Names("name type", "origin parent child axis limit mimic", others=True),
+    "joint": Names("name type", "origin parent child axis limit mimic calibration", others=True),
     "origin": Names("xyz rpy"),
     "parent": Names("link"),
     "child": Names("link"),
     "axis": Names("xyz"),
     "limit": Names("lower upper", others=True),
     "mimic": Names("joint multiplier offset"),
+    "calibration": Names("rising falling", others=True),
     "inertial": Names("", "origin mass inertia"),
     "mass": Names("value"),
     "collision": Names("name", "origin geometry", others=True),

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..calibration.record import CalibrationRecord
+from ..calibration.reprojection import Reprojection, reprojection
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray
 from ..core.text import pluralise
 from ..data.cameras.camera import AbstractCamera
 from ..data.observations.pixels import Pixels
-from ..diagnostics.reprojection import Reprojection, reprojection
 from ..kinematics.arm import Arm
 from ..summaries.tables import Table, by_columns, format_number, numbers
 from .arm import arm_poses
@@ -333,7 +333,10 @@ def camera_coverage(record: CalibrationRecord, camera: str | None = None, axes: 
 def camera_residuals(record: CalibrationRecord, camera: str | None = None, axes: Any = None) -> Any:
     """Plot the residuals of all corners as arrows on the image plane of a camera; the title has the magnification.
 
-    The arguments are those of `camera_coverage`.
+    Args:
+        record: The calibration.
+        camera: Name of the camera; the first one if None. `InputError` if the calibration has none of this name.
+        axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
         >>> aj.plot.camera_residuals(seen).figure.savefig("figure.svg")
@@ -345,7 +348,11 @@ def camera_distortion(record: CalibrationRecord, camera: str | None = None, axes
     """Plot how far the lens of a camera displaces what it would show without distortion; the title has the
     magnification of the arrows.
 
-    The arguments are those of `camera_coverage`. `InputError` if the camera has no distortion.
+    Args:
+        record: The calibration.
+        camera: Name of the camera; the first one if None. `InputError` if the calibration has none of this name, or if
+            it has no distortion.
+        axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
         >>> aj.plot.camera_distortion(seen).figure.savefig("figure.svg")

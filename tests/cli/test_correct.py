@@ -96,6 +96,42 @@ def test_positions_with_orientations(arms, orientation):
     np.testing.assert_allclose(q, Q[:1] + 0.02 * np.arange(3)[:, None], rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("given", ["readings", "poses", "points"])
+def test_poses_for_a_controller_that_takes_nothing_else(arms, given):
+    """The controller finds readings with the nominal arm; with them, the calibrated arm is where it was wanted."""
+    folder, nominal, calibrated = arms
+    q = Q[:1] + 0.02 * np.arange(3)[:, None]
+    wanted = np.asarray(nominal.pose(q))
+    wanted[:, :3, :3] = wanted[:1, :3, :3] if given == "points" else wanted[:, :3, :3]
+    near = f"--near={','.join(str(x) for x in Q[0] / DEG)}"
+    if given == "readings":
+        write(folder / "poses.csv", [f"q_{i}_deg" for i in range(1, 7)], q / DEG)
+        written, near, names = ("x_mm", "y_mm", "z_mm"), "--json", [f"{axis}_deg" for axis in ("rx", "ry", "rz")]
+    else:
+        written, names = ("x_m", "y_m", "z_m"), ["qw", "qx", "qy", "qz"] if given == "poses" else []
+        turns = Rotation.from_matrix(wanted[:, :3, :3]).as_quat(scalar_first=True)[:, : len(names)]
+        write(folder / "poses.csv", ["name", *written, *names], [
+            [f"p{i}", *row] for i, row in enumerate(np.hstack([wanted[:, :3, 3] / 1000, turns]))
+        ])  # fmt: skip
+    run(arms, "poses.csv", "-o", "out.csv", "--unit", "deg", near, "--write", "poses")
+    rows = table(folder / "out.csv")
+    assert (list(rows[0]) == ["name", *written, *names]) == (given != "readings")
+    commanded = wanted.copy()
+    commanded[:, :3, 3] = [[float(row[name]) for name in written] for row in rows]
+    commanded[:, :3, 3] *= 1 if given == "readings" else 1000
+    numbers = np.array([[float(row[name]) for name in names] for row in rows])
+    if names:
+        turns = (
+            Rotation.from_quat(numbers, scalar_first=True) if given == "poses" else Rotation.from_rotvec(numbers * DEG)
+        )
+        commanded[:, :3, :3] = turns.as_matrix()
+    reached = np.asarray(calibrated.pose(aj.kinematics.readings_at_poses(nominal, q, commanded).q))
+    assert np.linalg.norm(commanded[:, :3, 3] - wanted[:, :3, 3], axis=1).min() > 0.1
+    np.testing.assert_allclose(reached[:, :3, 3], wanted[:, :3, 3], rtol=0, atol=1e-5)
+    angle = 1e-8 if names else 0.02
+    np.testing.assert_allclose(reached[:, :3, :3], wanted[:, :3, :3], rtol=0, atol=angle)
+
+
 def test_what_is_not_reached_is_named_by_row_and_left_empty(arms):
     folder, _, calibrated = arms
     poses = np.asarray(calibrated.pose(Q[:3])).copy()

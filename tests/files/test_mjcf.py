@@ -45,7 +45,7 @@ TEXT = """<?xml version="1.0"?>
             <joint name="joint_2" pos="0.01 0.02 0.03" range="-100 120"/>
             <joint name="joint_3" pos="0.01 0 0.05" axis="1 0 0.01" ref="15" range="-90 90"/>
             <geom/>
-            <site name="shoulder"/>
+            <site name="shoulder"/><site name="hand"/>
             <body>
               <geom/>
               <body name="forearm" pos="0.35 0 0.03" xyaxes="0 1 0.1 -1 0 0">
