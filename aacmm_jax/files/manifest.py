@@ -13,7 +13,6 @@ from jaxtyping import Float
 
 from ..acceptance.results import Measured
 from ..core.errors import InputError, naming, nearest
-from ..core.rotations import roll_pitch_yaw_matrix
 from ..core.text import shorten
 from ..data.capture import Capture, ReferenceLength, check_readings, join_sessions
 from ..data.noise import ArmNoise
@@ -31,12 +30,12 @@ from .lerobot_motors import angles_by_motors
 from .manifest_pixels import Cameras, Detecting, Progress, observations_of, without_progress
 from .manifest_readings import Readings, points_of
 from .manifest_rows import Source, name_of, parts
-from .manifest_tables import TABLES, Length, PointsManifest, PosesManifest, Recorded
+from .manifest_tables import TABLES, Length, PointsManifest, PosesManifest, Recorded, base_transform
 from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
 from .reading_sets import other_readings, with_deviations
 from .toml import read_toml
-from .urdf import joint_names
+from .urdf_robots import joint_names
 
 _QUIETLY = Detecting()
 
@@ -191,17 +190,8 @@ def _nominal(folder: Path, model: Any) -> tuple[ArmSpecification, bool]:
     for name in model.bases:
         if name not in arms:
             raise InputError(f"bases names the unknown arm '{name}'{nearest(name, arms)}")
-    bases = {name: _base(np.array(numbers)) for name, numbers in model.bases.items()}
+    bases = {name: base_transform(np.array(numbers)) for name, numbers in model.bases.items()}
     return ArmSpecification(together(arms, bases=bases), " and ".join(arms)), False
-
-
-def _base(numbers: np.ndarray) -> np.ndarray:
-    """The transform of a position in mm, and roll, pitch and yaw in degrees where they are given."""
-    base = np.eye(4)
-    base[:3, 3] = numbers[:3]
-    if len(numbers) > 3:
-        base[:3, :3] = roll_pitch_yaw_matrix(np.radians(numbers[3:]))
-    return base
 
 
 def _usual_noise(folder: Path, arm: str, model: Any) -> ArmNoise | None:

@@ -20,6 +20,7 @@ from pydantic import (
 from ..acceptance.standards import Standard
 from ..core.errors import InputError
 from ..core.rotation_conventions import NUMBERS_OF_ROTATION, is_convention
+from ..core.rotations import roll_pitch_yaw_matrix
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import ReferenceLength
 from ..data.observations.held import Socket
@@ -236,6 +237,15 @@ class Sessions(Strict):
 
 
 Base = Annotated[list[FiniteFloat], AfterValidator(_three_or_six)]
+
+
+def base_transform(numbers: np.ndarray) -> np.ndarray:
+    """The transform of a position in mm, and roll, pitch and yaw in degrees where they are given."""
+    base = np.eye(4)
+    base[:3, 3] = numbers[:3]
+    if len(numbers) > 3:
+        base[:3, :3] = roll_pitch_yaw_matrix(np.radians(numbers[3:]))
+    return base
 
 
 class _Poses(Recorded):

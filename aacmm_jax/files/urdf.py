@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from functools import reduce
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from ..core.errors import InputError
 from ..core.rotations import roll_pitch_yaw
-from ..core.text import quoted, shorten
+from ..core.text import quoted
 from ..kinematics.arm import Arm, arm_of
 from ..kinematics.axes_to_dh import (
     Axes,
@@ -31,14 +31,12 @@ from ..kinematics.robots import chain_of
 from .mjcf import edited_mjcf
 from .mjcf_text import parse_robot
 from .outputs import write_text
-from .urdf_text import ExportedUrdf, Robot, UrdfJoint, edited, unused_name
+from .urdf_text import MOVING, ExportedUrdf, Robot, UrdfJoint, edited, listed_links, mimic_of, unused_name
 
 _REVOLUTION = (-2 * math.pi, 2 * math.pi)  # limits of a continuous joint: readings of -pi to pi and of 0 to 2 pi
 _LONGEST = 50_000.0  # mm; no serial chain is as long
 _LARGEST, _IN_DEGREES = 15.0, 720.0  # rad: limits of joints end below; those in degrees are mostly between
 _SAME_PLACE = 1e-9  # mm: a probe nearer to the tip link than this is no tool beyond it
-MOVING = ("revolute", "continuous", "prismatic")
-_LISTED = 12  # links that a message names
 
 
 class UrdfChain(NamedTuple):
@@ -314,20 +312,6 @@ def _attributes(transform: Transform) -> dict[str, str]:
     return {key: " ".join(repr(float(value) + 0.0) for value in three) for key, three in values.items()}
 
 
-def mimic_of(joint: UrdfJoint, robot: Robot) -> tuple[str, float, float]:
-    """The joint that a joint mimics, the factor and the offset, by readings in rad and mm."""
-    element = joint.element.child("mimic")
-    assert joint.mimics is not None
-    if element is None:  # an equality of MJCF, whose polynomial may be of any order
-        raise InputError(
-            f"joint {quoted(joint.name)} mimics {quoted(joint.mimics)}, which is followed only in a URDF; choose links "
-            "without this joint between them."
-        )
-    factor, offset = (float(element.numbers(*of)[0]) for of in (("multiplier", (1.0,)), ("offset", (0.0,))))
-    unit, followed = (1000.0 if kind == "prismatic" else 1.0 for kind in (joint.kind, robot.joints[joint.mimics].kind))
-    return joint.mimics, factor * unit / followed, offset * unit
-
-
 def _check_moving(joint: UrdfJoint, others: Container[str]) -> None:
     """Refuse a joint that an arm does not have; ``others`` are the joints that it may mimic."""
     what, slides = f"joint {quoted(joint.name)}", joint.kind == "prismatic"
@@ -371,12 +355,6 @@ def _joints_before(robot: Robot, link: str) -> list[UrdfJoint]:
         joints.append(robot.joint_before[link])
         link = joints[-1].parent
     return joints
-
-
-def joint_names(source: UrdfSource) -> list[str]:
-    """The names of the moving joints of the chain, from the base."""
-    path = joints_between(parse_robot(source.text), source.base, source.tip)
-    return [joint.name for joint in path if joint.kind != "fixed"]
 
 
 def joints_between(robot: Robot, base: str, tip: str) -> list[UrdfJoint]:
@@ -438,8 +416,3 @@ def ends_of(robot: Robot, base: str | None, given: Sequence[str]) -> tuple[str, 
     if not tips:
         raise InputError(f"there is no moving joint after {quoted(base)}; choose another base (base= or --base).")
     return base, tips
-
-
-def listed_links(links: Iterable[str]) -> str:
-    """Names of links as a message lists them."""
-    return shorten([quoted(link) for link in links], _LISTED)

@@ -15,8 +15,8 @@ from ..kinematics.robots import together
 from .inputs import InputFile
 from .mjcf import with_includes
 from .mjcf_text import parse_robot
-from .urdf import MOVING, UrdfChain, ends_of, joints_between, listed_links, located, mimic_of, urdf_chain
-from .urdf_text import Robot
+from .urdf import UrdfChain, ends_of, joints_between, located, urdf_chain
+from .urdf_text import MOVING, Robot, listed_links, mimic_of
 
 
 def read_urdf(
@@ -90,3 +90,9 @@ def moving_tips(robot: Robot, base: str, tips: list[str]) -> list[str]:
         ends.setdefault(moving[:-1], (0, robot.joints[moving[-1]].parent))
     inner = {moving[:count] for moving in ends for count in range(len(moving))}
     return [tip for moving, (_, tip) in ends.items() if moving not in inner and moving]
+
+
+def joint_names(source: UrdfSource) -> list[str]:
+    """The names of the moving joints of the chain, from the base."""
+    path = joints_between(parse_robot(source.text), source.base, source.tip)
+    return [joint.name for joint in path if joint.kind != "fixed"]

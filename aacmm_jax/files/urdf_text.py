@@ -4,7 +4,7 @@ The format's specification: wiki.ros.org/urdf/XML. Only direct children of ``<ro
 controllers and simulators have elements of the same names.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -12,13 +12,15 @@ from jaxtyping import Float
 
 from ..core.errors import InputError
 from ..core.rotations import roll_pitch_yaw_matrix
-from ..core.text import quoted
+from ..core.text import quoted, shorten
 from ..kinematics.axes_to_dh import Transform
 from .xml_text import Document, Element, Format, Names, replaced, with_values
 
 _LARGEST_ANGLE = 6.3  # rad, of roll, pitch and yaw: one revolution
 _METRE = 1000.0  # mm
 _ZERO = (0.0, 0.0, 0.0)
+MOVING = ("revolute", "continuous", "prismatic")
+_LISTED = 12  # links that a message names
 
 URDF = Format("a URDF", "robot", {
     "robot": Names("", "", "joint link", others=True),
@@ -218,6 +220,25 @@ def _shape(element: Element, origin: Transform) -> UrdfShape:
     if not np.all(size > 0):
         raise InputError(f"{element.where} has no positive size; give its {' and '.join(names)}.")
     return UrdfShape(element.name, origin, tuple(size.tolist()), "")
+
+
+def listed_links(links: Iterable[str]) -> str:
+    """Names of links as a message lists them."""
+    return shorten([quoted(link) for link in links], _LISTED)
+
+
+def mimic_of(joint: UrdfJoint, robot: Robot) -> tuple[str, float, float]:
+    """The joint that a joint mimics, the factor and the offset, by readings in rad and mm."""
+    element = joint.element.child("mimic")
+    assert joint.mimics is not None
+    if element is None:  # an equality of MJCF, whose polynomial may be of any order
+        raise InputError(
+            f"joint {quoted(joint.name)} mimics {quoted(joint.mimics)}, which is followed only in a URDF; choose links "
+            "without this joint between them."
+        )
+    factor, offset = (float(element.numbers(*of)[0]) for of in (("multiplier", (1.0,)), ("offset", (0.0,))))
+    unit, followed = (1000.0 if kind == "prismatic" else 1.0 for kind in (joint.kind, robot.joints[joint.mimics].kind))
+    return joint.mimics, factor * unit / followed, offset * unit
 
 
 def edited(text: str, origins: Mapping[str, Mapping[str, str]], robot: Robot, added: str = "") -> str:

@@ -11,19 +11,21 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..core.arguments import NOT_EMPTY, Range, checked, items_of, shown
-from ..core.arrays import Numbers, as_array, as_floats, is_concrete
-from ..core.errors import InputError, nearest
+from ..core.arguments import NOT_EMPTY, Range, checked, items_of
+from ..core.arrays import Numbers, as_floats
+from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, in_chunks, namespace, numpy_if_known, to_jax, to_numpy
-from .beside import COLUMNS, Beside, extras
+from .arm_names import AXES, LENGTHS, located, natural_steps, probe_names
+from .arm_names import is_length as is_length
+from .beside import COLUMNS, Beside
 from .chain import Corrections, Geometry, JointKinds, tip_pose
 from .jacobian import Indices, tip_jacobian, tip_position
-from .joint_checks import Limits, checked_chains, checked_limits, checked_mimic
+from .joint_checks import Limits, checked_chains, checked_limits, checked_mimic, checked_readings
+from .joint_checks import check_chain as check_chain
+from .joint_checks import check_columns as check_columns
+from .joint_checks import with_chains as with_chains
 
-LENGTHS = ("a", "d", "probe")
 DOWN = (0.0, 0.0, -1.0)
-_AXES = ("x", "y", "z")
-_LENGTH_STEP, _ANGLE_STEP = 1.0, 1e-3  # comparable at the tip of an arm of about 1 m
 JointLimits = Float[np.ndarray, "n 2"]
 NEARLY_PARALLEL = 0.02  # |sin alpha|, about 1 degree, below which Denavit-Hartenberg parameters are nearly singular
 _BY_JOINT, _BY_TERM, _VECTOR = (Float[Array, shape] for shape in ("... joints", "... coefficients", "... 3"))
@@ -242,55 +244,6 @@ def _evaluated(function: Callable, arm: Arm, q: Numbers) -> Any:
     return values if namespace(geometry, q) is np else to_jax(values)
 
 
-def checked_readings(arm: Arm, q: Numbers, like: AnyArray | None = None) -> Float[AnyArray, "... n"]:
-    """Readings as an array like the arm's or another, or `InputError` where they do not have the arm's columns."""
-    array, joints = as_array(q, "q", like=arm.alpha if like is None else like), arm.joints
-    if array.ndim == 0 or array.shape[-1] not in arm.possible_columns:
-        raise InputError(
-            f"q has shape {array.shape}, but the arm has {joints} joints{_beside_joints(arm)}; the last axis must run "
-            "over the joints."
-        )
-    check_chain(arm, array, "q")
-    return array
-
-
-def check_chain(arm: Arm, readings: AnyArray, where: str) -> None:
-    """Raise `InputError` where known readings of a robot, which ``where`` names, have a number that is no chain's."""
-    if arm.chains and is_concrete(readings):
-        chain = np.asarray(readings)[..., arm.joints]
-        wrong = ~np.isin(chain, np.arange(len(arm.chains)))
-        if np.any(wrong):
-            raise InputError(
-                f"{where} has the chain {chain[wrong].flat[0]:g} in the column after the joints; give the number of a "
-                f"chain, 0 to {len(arm.chains) - 1}."
-            )
-
-
-def with_chains(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m columns"]:
-    """Readings of all joints with the number of a chain, which take turns; those of an arm without chains as they
-    are."""
-    return np.column_stack([q, np.arange(len(q)) % len(arm.chains)]) if arm.chains else q
-
-
-def _beside_joints(arm: Arm) -> str:
-    return ", the number of a chain" * bool(arm.chains) + extras(arm.beside.possible)
-
-
-def check_columns(arm: Arm, columns: int) -> None:
-    """Raise `InputError` where readings of a capture have not the columns of an arm; without temperatures it was at
-    20 C."""
-    if columns not in arm.possible_columns:
-        other = _beside_joints(arm)
-        if columns == arm.joints + 1:
-            other = ", or use an arm with thermometer=True if the last column is the temperature"
-        elif columns >= 2 * arm.joints and "torques" not in arm.beside.possible:
-            other = ", or use an arm with torques=True if columns of torques follow"
-        raise InputError(
-            f"the capture has {columns} columns, but the arm has {arm.joints} joints; give one column per joint{other}."
-        )
-    arm.beside.names(columns)
-
-
 def joint_limits(arm: Arm, limits: Limits | None) -> JointLimits:
     """Lowest and highest reading of each joint: those given, else the arm's own, else -pi to pi; rad, or mm.
     `InputError` where a prismatic joint has neither."""
@@ -384,48 +337,18 @@ def tips_of(arm: Arm) -> int:
     return max(1, len(arm.chains))
 
 
-def probe_names(tips: int) -> list[str]:
-    """Names of the coordinates of the tips: ``probe_x|y|z`` of the first, ``probe2_x`` of the second."""
-    return [f"probe{'' if tip == 1 else tip}_{axis}" for tip in range(1, tips + 1) for axis in _AXES]
-
-
 def correction_names(arm: Arm) -> tuple[str, ...]:
     """Names of the coefficients of an arm's corrections, and of the components of gravity where some depend on it."""
     corrections = arm.corrections
     if corrections is None:
         return ()
     functions = corrections.functions
-    return (*functions.names, *(f"gravity_{axis}" for axis in _AXES if functions.by_gravity.any()))
+    return (*functions.names, *(f"gravity_{axis}" for axis in AXES if functions.by_gravity.any()))
 
 
 def locate(arm: Arm, name: str) -> tuple[str, int]:
     """Kind and 0-based index of a parameter name: ``d_3 -> ("d", 2)``; an `InputError` names the nearest spelling."""
     return located(arm.joints, correction_names(arm), name, tips_of(arm))
-
-
-def located(
-    joints: int, corrections: tuple[str, ...], name: str, tips: int = 1, extra: tuple[str, ...] = ()
-) -> tuple[str, int]:
-    """`locate` for an arm with so many joints, corrections of these names, and so many tips."""
-    kinds = ("alpha", "a", "d", "theta", "beta", *extra)
-    kind, _, index = name.rpartition("_") if isinstance(name, str) else ("", "", "")
-    if (kind == "probe" or name in corrections) and index in _AXES:
-        return kind, _AXES.index(index)
-    if tips > 1 and name in (probes := probe_names(tips)):
-        return "probe", probes.index(name)
-    if name in corrections:
-        return "coefficients", corrections.index(name)
-    if kind in kinds and index.isdecimal() and str(int(index)) == index and 1 <= int(index) <= joints:
-        return kind, int(index) - 1
-    names = [*(f"{k}_{i}" for k in kinds for i in range(1, joints + 1)), *probe_names(tips)]
-    given = name if isinstance(name, str) else shown(name)
-    raise InputError(f"unknown parameter '{given}' of a {joints}-joint arm{nearest(given, [*names, *corrections])}")
-
-
-def is_length(name: str) -> bool:
-    """Whether a parameter name is a length (a, d, probe) and not an angle."""
-    kind = name.rpartition("_")[0]
-    return kind in LENGTHS or (kind.startswith("probe") and kind[5:].isdecimal())
 
 
 def parameter_unit(arm: Arm, name: str) -> str:
@@ -435,11 +358,6 @@ def parameter_unit(arm: Arm, name: str) -> str:
         term = arm.corrections.functions.terms[i]
         return term.unit.replace("rad", "mm") if term.joint in arm.prismatic else term.unit
     return "1" if kind == "gravity" else "mm" if kind in LENGTHS else "rad"
-
-
-def natural_steps(names: Sequence[str]) -> Float[np.ndarray, " p"]:
-    """Natural step of each named parameter: 1 mm for a length, 1 mrad for an angle."""
-    return np.where([is_length(name) for name in names], _LENGTH_STEP, _ANGLE_STEP)
 
 
 def value_of(arm: Arm, name: str) -> np.ndarray:

@@ -1,10 +1,17 @@
-"""Checks of what is stated of an arm's joints: limits, chains, and joints that follow others."""
+"""Checks of what is stated of an arm's joints: limits, chains, joints that follow others; and of its readings."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
+from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
+from ..core.numpy_or_jax import AnyArray
 from ..core.text import pluralise
+from .beside import extras
 
 Limits = Sequence[Sequence[float]]  # lowest and highest reading of each joint
 
@@ -64,3 +71,52 @@ def checked_limits(
                 "upper limit."
             )
     return tuple((low, high) for low, high in rows)
+
+
+def checked_readings(arm: Any, q: Numbers, like: AnyArray | None = None) -> Float[AnyArray, "... n"]:
+    """Readings as an array like the arm's or another, or `InputError` where they do not have the arm's columns."""
+    array, joints = as_array(q, "q", like=arm.alpha if like is None else like), arm.joints
+    if array.ndim == 0 or array.shape[-1] not in arm.possible_columns:
+        raise InputError(
+            f"q has shape {array.shape}, but the arm has {joints} joints{_beside_joints(arm)}; the last axis must run "
+            "over the joints."
+        )
+    check_chain(arm, array, "q")
+    return array
+
+
+def check_chain(arm: Any, readings: AnyArray, where: str) -> None:
+    """Raise `InputError` where known readings of a robot, which ``where`` names, have a number that is no chain's."""
+    if arm.chains and is_concrete(readings):
+        chain = np.asarray(readings)[..., arm.joints]
+        wrong = ~np.isin(chain, np.arange(len(arm.chains)))
+        if np.any(wrong):
+            raise InputError(
+                f"{where} has the chain {chain[wrong].flat[0]:g} in the column after the joints; give the number of a "
+                f"chain, 0 to {len(arm.chains) - 1}."
+            )
+
+
+def with_chains(arm: Any, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m columns"]:
+    """Readings of all joints with the number of a chain, which take turns; those of an arm without chains as they
+    are."""
+    return np.column_stack([q, np.arange(len(q)) % len(arm.chains)]) if arm.chains else q
+
+
+def _beside_joints(arm: Any) -> str:
+    return ", the number of a chain" * bool(arm.chains) + extras(arm.beside.possible)
+
+
+def check_columns(arm: Any, columns: int) -> None:
+    """Raise `InputError` where readings of a capture have not the columns of an arm; without temperatures it was at
+    20 C."""
+    if columns not in arm.possible_columns:
+        other = _beside_joints(arm)
+        if columns == arm.joints + 1:
+            other = ", or use an arm with thermometer=True if the last column is the temperature"
+        elif columns >= 2 * arm.joints and "torques" not in arm.beside.possible:
+            other = ", or use an arm with torques=True if columns of torques follow"
+        raise InputError(
+            f"the capture has {columns} columns, but the arm has {arm.joints} joints; give one column per joint{other}."
+        )
+    arm.beside.names(columns)
