@@ -3,8 +3,8 @@
 ``python benchmarks/verification.py [--deliveries N]`` draws arms whose parameters are 0.5 mm and 1 mrad off their
 drawing, and what their makers state: the true parameters with errors of a tenth to a half of that (good), or those of
 another robot of the type, the right ones with wrong signs, or with errors of one to two times that (bad). Poses, with a
-repeatability of 0.03 mm: eight in each of two sockets, with or without a certified distance; twelve seen by a tracker;
-twelve images of a board by a camera on the arm. What is true is the RMS error of 400 tips over the whole workspace, by
+repeatability of 0.03 mm: eight in each of two sockets, with or without a certified distance, or in four; twelve seen by
+a tracker; twelve images of a board by a camera on the arm. True is the RMS error of 400 tips over the workspace by
 either arm, with base frame and tip fitted. Prints the verdicts against the ratio of these errors, the share of 95 %
 intervals of the RMS error that contain that of five times as many such poses, and what recalibrations promise.
 """
@@ -22,7 +22,7 @@ from aacmm_jax.kinematics.arm import is_length, joint_limits, parameter_names
 from aacmm_jax.kinematics.parameters import ArmSpecification
 
 kinds = aj.data.observations
-ROBOTS, KINDS = ("ur5e", "ur10e", "fr3", "irb120"), ("sockets", "sockets and length", "tracker", "board")
+ROBOTS, KINDS = ("ur5e", "ur10e", "fr3", "irb120"), ("sockets", "sockets and length", "two places", "tracker", "board")
 LENGTH, ANGLE = 0.5, 1e-3  # standard deviations of the true parameters, mm and rad
 REPEATABILITY, TOOL = 0.03, np.array([15.0, -30.0, 110.0])  # mm
 POSES, SEEN, TESTED = 8, 12, 400
@@ -76,7 +76,9 @@ def recorded(true: aj.Arm, kind: str, seed: int, times: int = 1) -> aj.Capture:
     sockets = {"A": (-350.0, -200.0, 100.0), "B": (-250.0, -200.0, 100.0)}
     if true.joints == 7 or (true.joints == 6 and float(np.asarray(true.d)[0]) > 250):  # those that reach forward
         sockets = {name: (400.0, y, 200.0) for name, (_, y, _) in zip("AB", ((0, 0.0, 0), (0, 100.0, 0)), strict=True)}
-    lengths = [aj.ReferenceLength("A", "B", 100.0, u=0.03)] if "length" in kind else []
+    if kind == "two places":  # the plate is moved
+        sockets |= {"C": (-150.0, 300.0, 350.0), "D": (-150.0, 300.0, 450.0)}
+    lengths = [aj.ReferenceLength("A", "B", 100.0, u=0.03)] if kind != "sockets" else []
     return aj.simulate(true, sockets, poses=poses, lengths=lengths, **options)
 
 

@@ -1,6 +1,7 @@
 """``arm``: an arm looked at before its first calibration, a template of an arm file, readings compared with an arm."""
 
 import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -168,11 +169,15 @@ def _checked_table(specification: Any, path: Path, unit: str | None) -> dict[str
     return _check_summary(specification, check, capture, table.unit, table.length_unit)
 
 
-def checked_recording(specification: Any, recording: Any, manifest: Path | None) -> dict[str, Any]:
-    """What a check of a recording finds, with the lines of its manifest that correct it, where it has one."""
+def checked_recording(
+    specification: Any, recording: Any, manifest: Path | None, written: Sequence[Any] = ()
+) -> dict[str, Any]:
+    """What a check of a recording finds, with the lines of its manifest that correct it, where it has one; ``written``
+    are its rotations, of which any convention is tried."""
     from ..diagnostics.capture_check import check_capture
-    from ..files.reading_checks import positions_unit
-    from ..pipeline.reading_sets import compare_reading_sets, reading_sets_sentence
+    from ..files.manifest import deviations_of_manifest
+    from ..files.reading_checks import positions_unit, rotation_rows
+    from ..pipeline.reading_sets import compare_points, compare_reading_sets, points_sentence, reading_sets_sentence
 
     check = with_spinner("Comparing", lambda: check_capture(specification.arm, recording.capture))
     unit = "rad" if manifest is None else None
@@ -181,6 +186,10 @@ def checked_recording(specification: Any, recording: Any, manifest: Path | None)
     if manifest is not None:
         sets = with_spinner("Calibrating", lambda: compare_reading_sets(recording))
         summary |= {"reading_sets": sets, "reading_sets_sentence": reading_sets_sentence(sets, check.poses)}
+        others = deviations_of_manifest(manifest)
+        points = with_spinner("Calibrating", lambda: compare_points(recording, others))
+        summary |= {"points": points, "points_sentence": points_sentence(points)}
+        summary["rotations"] = rotation_rows(manifest, written, check, specification.arm)
     return summary
 
 
@@ -198,13 +207,17 @@ def _check_summary(
     from ..diagnostics.reading_check import reading_check_summary
     from ..files.reading_checks import angles_toml, units_toml
 
-    angles = check.explained and check.best.hypothesis._replace(length=1.0).changes
+    angles = check.couplings or (check.explained and check.best.hypothesis._replace(length=1.0).changes)
+    explanation = check.given if check.couplings else check.best
     return reading_check_summary(check, specification.name, unit=unit, positions=positions) | {
-        "angles": angles_toml(check.best, unit, manifest) if angles else None,
+        "angles": angles_toml(explanation, unit, manifest, check.couplings) if angles else None,
         "units": units_toml(check.best, positions) if check.explained else None,
         "standing": standing_rows(specification.arm, capture, nominal),
         "reading_sets": [],
         "reading_sets_sentence": "",
+        "points": [],
+        "points_sentence": "",
+        "rotations": [],
     }
 
 
@@ -221,6 +234,8 @@ def reading_check(summary: dict[str, Any]) -> View:
         alternatives_sentence(summary["alternatives"], summary["known_positions"]),
         *(Styled(row["says"], "yellow") for row in summary["standing"]),
         summary["reading_sets_sentence"],
+        summary["points_sentence"],
+        *_rotations(summary["rotations"]),
     ))  # fmt: skip
     for key, where in (("units", ", in the table of the measured positions"), ("angles", "")):
         if summary[key] is not None:
@@ -229,6 +244,36 @@ def reading_check(summary: dict[str, Any]) -> View:
         f"\n{pluralise(summary['poses'], 'pose')}; {summary['hypotheses']:,} combinations of column order, signs, "
         "zero offsets and units were tried."
     )
+
+
+def _rotations(rows: Sequence[dict[str, Any]]) -> Iterator[Any]:
+    """The conventions of measured rotations: what fits, a table, and the lines of the manifest."""
+    for name in dict.fromkeys(row["table"] for row in rows):
+        of_table = [row for row in rows if row["table"] == name]
+        best, fitting = of_table[0], [row for row in of_table if row["fits"]]
+        if not fitting:
+            yield Styled(
+                f"No convention makes the rotations of '{name}' fit the arm: {best['rms_deg']:.3g} deg RMS at best.",
+                "red",
+            )
+        else:
+            others = [row for row in fitting[1:] if not row["equivalent"]]
+            equal = len(fitting) - 1 - len(others)
+            yield (
+                f"The rotations of '{name}' are {best['rotation']}{' in ' * bool(best['unit'])}{best['unit']}: "
+                f"{best['rms_deg']:.3g} deg RMS with the nominal arm"
+                + (f"; {pluralise(equal, 'other convention')} equivalent in these poses" if equal else "")
+                + (f"; {pluralise(len(others), 'other convention')} fit as well" if others else "")
+                + ("." if best["taken"] else f". Write in its table: {' and '.join(best['lines'])}")
+            )
+        columns: dict[str, Any] = {
+            "convention": "rotation",
+            "unit": "unit",
+            "positions [mm]": "rms_mm",
+            "orientations [deg]": "rms_deg",
+            "fits": lambda row: ("equivalent" if row["equivalent"] else "yes") if row["fits"] else "no",
+        }
+        yield listed("", of_table, columns)
 
 
 def survey(summary: dict[str, Any]) -> View:

@@ -10,7 +10,8 @@ from .. import data, files, pipeline, summaries
 from ..core.errors import InputError
 from ..core.text import quoted
 from ..core.units import DEG
-from ..files.inputs import ROBOT_FILES
+from ..files.inputs import ROBOT_FILES, InputFile
+from ..files.manifest import written_rotations
 from ..files.outputs import together
 from . import options, views
 from .app import command, progress_bar, read_with_progress, show_summary, tracked, with_spinner
@@ -186,8 +187,10 @@ def import_(
     check: bool = flag(
         "--check",
         "Check the readings against the arm: find the order, signs, zero offsets and units of the columns, and the "
-        "joints that do not move. If the tables contain both commanded and measured readings, compare them. Exit with "
-        "code 1 if no order, signs, zero offsets and units make the readings fit the arm.",
+        "joints that do not move, joints that turn with another joint, and the convention of measured rotations, which "
+        "need not be stated then. If the tables contain both commanded and measured readings, or positions and "
+        "deviations from them, compare them. Exit with code 1 if no order, signs, zero offsets and units make the "
+        "readings fit the arm.",
     ),
     overlays: Path | None = option(
         "Write a picture of each image to this folder, with the corners that were found in it.", "FOLDER"
@@ -200,7 +203,11 @@ def import_(
             "no output file is given; give -o FILE.h5 to write a capture, or --check to check the readings only."
         )
     with together(output):
-        recording = read_with_progress(manifest, overlays)
+        written = []
+        if check and output is None and "[[transforms]]" in InputFile(manifest).text:
+            recording, written = written_rotations(manifest)
+        else:
+            recording = read_with_progress(manifest, overlays)
         summary = summaries.calibration.capture_summary(recording)
         if output is not None:
             files.save_capture(output, recording, summary)
@@ -208,7 +215,7 @@ def import_(
     if not check:
         show_summary(summary, as_json, views.capture)
         return
-    summary["check"] = checked_recording(recording.nominal, recording, manifest)
+    summary["check"] = checked_recording(recording.nominal, recording, manifest, written)
     show_summary(summary, as_json, lambda s: (*views.capture(s), "", *reading_check(s["check"])))
     if not summary["check"]["explained"]:
         raise typer.Exit(1)

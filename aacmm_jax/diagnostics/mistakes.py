@@ -85,8 +85,9 @@ def _of_check(case: Case) -> Mistake | None:
     cameras = shorten([part.name for part in record.capture.observations if isinstance(part, Pixels)], 3)
     if cameras and not check.explained and given > _FAR_OFF * total_link_length(record.nominal.arm):
         return Mistake(
-            f"Likely cause: the images of {cameras} do not belong to the rows of the readings, are of several cameras, "
-            "or the camera or target moved: no order, signs and zeros of the joints explain what was seen."
+            f"Likely cause: the images of {cameras} do not belong to the rows of the readings or are of several "
+            "cameras, on_arm in the manifest is wrong, or the camera or target was moved: no order, signs and zeros of "
+            "the joints explain what was seen."
         )
     if not check.explained or check.best == check.given or best * _BETTER > given:
         return None

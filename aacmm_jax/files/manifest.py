@@ -9,13 +9,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from ..acceptance.results import Measured
 from ..core.errors import InputError, naming, nearest
 from ..core.text import shorten
 from ..data.capture import Capture, ReferenceLength, check_readings, join_sessions
 from ..data.observations.held import Socket
-from ..data.recording import ProbedSphere, ReadImage, Recording, checked_sphere
+from ..data.observations.measured import MeasuredPoints
+from ..data.recording import ProbedSphere, ReadImage, ReadingSet, Recording, checked_sphere
 from ..kinematics.arm import Arm, reading_as
 from ..kinematics.parameters import ArmSpecification
 from ..kinematics.workspace import Reach
@@ -28,7 +30,7 @@ from .manifest_rows import Source, name_of, parts
 from .manifest_tables import TABLES, Length, PointsManifest, PosesManifest, Recorded
 from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
-from .reading_sets import other_readings
+from .reading_sets import other_readings, with_deviations
 from .toml import read_toml
 from .urdf import joint_names
 
@@ -75,16 +77,48 @@ def read_manifest(
 
 def readings_of_manifest(path: str | os.PathLike) -> Readings:
     """With which columns and unit the first table that a manifest names was read. Raises `InputError`."""
-    return _read(path)[1]
+    return _read(path, written=[])[1]
 
 
-def _read(path: str | os.PathLike, detecting: Detecting = _QUIETLY) -> tuple[Recording, Readings]:
+def deviations_of_manifest(path: str | os.PathLike) -> list[ReadingSet]:
+    """The captures of a manifest with deviations added to its measured points, and subtracted from them, where its
+    table has columns of these. Raises `InputError`."""
+    manifest = InputFile(path)
+    if "[[points]]" not in manifest.text and "[[transforms]]" not in manifest.text:
+        return []
+    return with_deviations(
+        manifest, readings_of_manifest(manifest).header, lambda changed: _read(changed, written=[])[0]
+    )
+
+
+class WrittenRotations(NamedTuple):
+    """Measured orientations as a table of a manifest has them."""
+
+    table: int  # its number among those of its kind
+    name: str
+    q: Float[np.ndarray, "m n"]  # rad
+    points: Float[np.ndarray, "m 3"]  # mm
+    numbers: Float[np.ndarray, "m k"]
+    unit: str | None  # where the manifest or the header states one
+
+
+def written_rotations(path: str | os.PathLike) -> tuple[Recording, list[WrittenRotations]]:
+    """What a manifest's tables of orientations hold, whatever their convention, and the recording without them: the
+    orientations of transforms that have positions only. Raises `InputError`."""
+    written: list[WrittenRotations] = []
+    return _read(path, written=written)[0], written
+
+
+def _read(
+    path: str | os.PathLike, detecting: Detecting = _QUIETLY, written: list[WrittenRotations] | None = None
+) -> tuple[Recording, Readings]:
     model = read_toml(manifest := InputFile(path), PosesManifest)
     path = as_path(path)
     with naming(path):
         arm = arm_beside(path.parent, model.arm)
         nominal, proposed = read_arm(arm, base=model.base, tip=model.tip, probe=model.probe)
         source = Source(manifest, "q")
+        source.rotation_units = None if written is None else {}
         angles = model.angles
         if angles is not None and angles.calibration is not None:
             angles = angles_by_motors(angles, source.open(angles.calibration), nominal.arm.joints)
@@ -101,12 +135,19 @@ def _read(path: str | os.PathLike, detecting: Detecting = _QUIETLY) -> tuple[Rec
                 seen, read = observations_of(cameras, source, entry, values, detecting)
                 observed, images = [*observed, *seen], [*images, *read]
         for kind in TABLES:
-            for entry in () if kind is Socket else getattr(model, kind.table):
+            for number, entry in enumerate(() if kind is Socket else getattr(model, kind.table)):
                 for values in _fields(path.parent, entry, kind.table):
                     name = name_of(entry, values)
                     for part in parts(source, kind, entry, values, f"[[{kind.table}]] '{name}'"):
                         named = f"{name}/{part.group}" if entry.group is not None else name
-                        observed.append((part.session, kind.rebuilt(named, part.rows)))
+                        made, rows = kind, part.rows
+                        if written is not None and source.rotation_units and "rotations" in rows:
+                            unit = source.rotation_units[f"[[{kind.table}]] '{name}'"]
+                            row = rows["q"], rows["points"], rows["rotations"], unit
+                            written.append(WrittenRotations(number, named, *row))
+                            made, kept = MeasuredPoints, {entry.name for entry in MeasuredPoints.entries}
+                            rows = {key: value for key, value in rows.items() if key in kept} | {"target": named}
+                        observed.append((part.session, made.rebuilt(named, rows)))
         if not observed:
             raise InputError("the manifest contains no [[socket]] and no other observation; add at least one.")
         probe = "remounted" if model.sessions is None else model.sessions.probe

@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..core.errors import InputError, nearest
+from ..core.rotation_conventions import NUMBERS_OF_ROTATION, is_of_angles, numbers_of, rotation_matrices
 from ..core.text import quoted, shorten
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.observations.declared import Declared, Entry
 from .inputs import InputFile, fingerprint
 from .manifest_files import PRESETS, Preset, as_list
 from .manifest_readings import Wanted, checked_unit
-from .manifest_tables import NUMBERS_OF_ROTATION
 from .patterns import check_name, fields_of, fill
 from .table_sources.sources import InputFolder, input_table, is_recording
 from .text_lines import TABLE_SHARE, Column
@@ -38,6 +38,8 @@ class Source:
 
     def __init__(self, manifest: InputFile, quantity: str):
         self.folder, self.quantity, self._files = Path(manifest).parent, quantity, [manifest]
+        # Where a dictionary, rotations are left as the numbers of their table, whose unit it has for each table.
+        self.rotation_units: dict[str, str | None] | None = None
         self.notes: dict[str, None] = {}  # what was read of files that are more than a table
 
     def open(self, path: str) -> InputFile:
@@ -137,6 +139,12 @@ class _Reader:
         self._columns = {key: as_list(picked) for key, picked in columns.items()}
         if getattr(table, "session", None) is not None and "session" in columns:
             raise InputError(f"{where}: session is given both as a key and in columns; give it only once.")
+        # Columns that are added to, or subtracted from, those of an entry.
+        both = [(getattr(table, "plus", {}), 1.0), (getattr(table, "minus", {}), -1.0)]
+        self._added = [(key, picked, sign) for keys, sign in both for key, picked in keys.items()]
+        for key, *_ in self._added:
+            if key not in self.entries or self.entries[key].content != "number" or self.entries[key].unit == "1":
+                raise InputError(f"{where}: plus and minus do not apply to '{key}'; give entries such as points.")
         may_have_sessions = source.quantity == "q" and hasattr(table, "session")
         for key in (*columns, *table.units):
             if key not in self.entries and not (key == "session" and key in columns and may_have_sessions):
@@ -176,7 +184,13 @@ class _Reader:
                 f"{quoted(str(table.group))}, which names the group of the row; fill the cell, or delete the row."
             )
         of_session, main = chosen.pop("session", None), chosen.pop(source.quantity, None)
-        others = [*chosen.values(), of_session or [], [] if table.group is None else [table.group]]
+        added = [(key, as_list(columns), sign) for key, columns, sign in self._added]
+        others = [
+            *chosen.values(),
+            *(columns for _, columns, _ in added),
+            of_session or [],
+            [] if table.group is None else [table.group],
+        ]
         readings = text if self._own_file is None else self._open(self._own_file, table.readings_table, 0)
         wanted = Wanted(
             main,
@@ -187,6 +201,10 @@ class _Reader:
         )
         rows_of = {source.quantity: (rows := source.rows(readings, wanted))}
         rows_of |= {key: self._column(text, self.entries[key], columns) for key, columns in chosen.items()}
+        for key, columns, sign in added:
+            if key not in chosen:
+                raise InputError(f"{self._where}: plus and minus need columns of {key}; pick them with columns.")
+            rows_of[key] = rows_of[key] + sign * self._column(text, self.entries[key], columns)
         if label and self._label is not None:
             rows_of[self._label] = np.full(len(rows), label)
         rows_of["session"] = np.full(len(rows), session) if of_session is None else text.texts(of_session[0])
@@ -252,27 +270,23 @@ class _Reader:
         return 1.0 if unit is None else units[unit] ** (2 if entry.unit == "mm^2" else 1)
 
     def _rotations(self, entry: Entry, numbers: np.ndarray, header: str | None) -> np.ndarray:
-        from scipy.spatial.transform import Rotation
-
+        if self._source.rotation_units is not None:
+            self._source.rotation_units[self._where] = self._table.units.get(entry.name) or header
+            return numbers
         convention = self._table.rotation or self._preset.rotation
         if convention is None:
             raise InputError(
                 f"{self._where} does not state the convention of its rotations; give rotation = "
-                f"{', '.join(NUMBERS_OF_ROTATION)}, or three axes such as XYZ or xyz."
+                f"{', '.join(NUMBERS_OF_ROTATION)}, or three axes such as XYZ or xyz; aacmm import --check finds it."
             )
-        self._check_count(entry.name, numbers.shape[1], (NUMBERS_OF_ROTATION.get(convention, 3),))
-        if convention == "matrix":
-            return numbers.reshape(-1, 3, 3)
-        if convention.startswith("quaternion"):
-            if not np.allclose(np.linalg.norm(numbers, axis=1), 1, atol=1e-3):
-                raise InputError(
-                    f"{self._where} has quaternions whose length is not 1; check that the right four columns are "
-                    "picked."
-                )
-            return Rotation.from_quat(numbers, scalar_first=convention.endswith("wxyz")).as_matrix()
-        numbers = numbers * self._unit(entry, header)
-        vector = convention == "vector"
-        return (Rotation.from_rotvec(numbers) if vector else Rotation.from_euler(convention, numbers)).as_matrix()
+        self._check_count(entry.name, numbers.shape[1], (numbers_of(convention),))
+        if numbers.shape[1] == 4 and not np.allclose(np.linalg.norm(numbers, axis=1), 1, atol=1e-3):
+            raise InputError(
+                f"{self._where} has quaternions whose length is not 1; check that the right four columns are picked."
+            )
+        return rotation_matrices(
+            numbers * self._unit(entry, header) if is_of_angles(convention) else numbers, convention
+        )
 
     def stated(self, values: Mapping[str, str]) -> dict[str, Any]:
         """What the manifest itself states, in mm and rad."""

@@ -2,7 +2,6 @@
 
 import datetime
 import math
-import re
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -20,6 +19,7 @@ from pydantic import (
 
 from ..acceptance.standards import Standard
 from ..core.errors import InputError
+from ..core.rotation_conventions import NUMBERS_OF_ROTATION, is_convention
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import ReferenceLength
 from ..data.observations.held import Socket
@@ -33,18 +33,16 @@ from .manifest_cameras import CameraTable, PixelsTable, TargetTable
 from .manifest_files import NamedTable, Picked, Table
 from .toml import Point, Strict, each_once
 
-NUMBERS_OF_ROTATION = {"vector": 3, "quaternion wxyz": 4, "quaternion xyzw": 4, "matrix": 9}
-_EULER = re.compile("[xyz]{3}|[XYZ]{3}")
 _OF_TIME = BeforeValidator(lambda time: time.date() if isinstance(time, datetime.datetime) else time)
 _Day = Annotated[datetime.date, Field(strict=False), _OF_TIME]
 _ByJoint = PositiveFloat | Annotated[list[PositiveFloat], Field(min_length=1)]
 
 
 def _rotation(text: str) -> str:
-    if text not in NUMBERS_OF_ROTATION and not _EULER.fullmatch(text):
+    if not is_convention(text):
         raise ValueError(
             f"'{text}' is not a convention for rotations; give {', '.join(NUMBERS_OF_ROTATION)}, or three axes such "
-            "as XYZ (moving axes, R = Rx Ry Rz) or xyz (fixed axes, R = Rz Ry Rx)."
+            "as XYZ (moving axes, R = Rx Ry Rz) or xyz (fixed axes, R = Rz Ry Rx), each also with ' inverse' after it."
         )
     return text
 
@@ -61,6 +59,7 @@ class Angles(Strict):
     directions: Picked | None = None  # columns of the directions from which the joints were moved: 1, -1, or 0
     linear_unit: Literal["mm", "m", "um", "inch", "counts"] = "mm"  # of prismatic joints
     counts_per_mm: _ByJoint | None = None
+    coupled: dict[Annotated[str, Field(pattern="^[1-9][0-9]?$")], Annotated[int, Field(ge=-99, le=99)]] | None = None
 
     calibration: str | None = None  # LeRobot's file of the motors
 
@@ -98,7 +97,16 @@ class Angles(Strict):
         angular = 2 * math.pi / numbers("counts_per_turn") if self.counts_per_turn else ANGLE_UNITS[self.unit]
         linear = 1 / numbers("counts_per_mm") if self.counts_per_mm else LENGTH_UNITS[self.linear_unit]
         units = np.where(by_joint(arm, False, True), linear, angular)
-        return numbers("sign") * (readings - numbers("offset")) * units
+        q = numbers("sign") * (readings - numbers("offset")) * units
+        for moved, source in (self.coupled or {}).items():  # joint 3 turns by its reading, and by joint 2's: { 3 = 2 }
+            joint, other = int(moved), abs(source)
+            if not (0 < other <= arm.joints and joint <= arm.joints and joint != other):
+                raise InputError(
+                    f"angles.coupled has {moved} = {source}, but the arm has {arm.joints} joints; write the number of "
+                    "a joint, and that of the joint whose angle is added to its reading, negative to subtract it."
+                )
+            q[:, joint - 1] += np.sign(source) * q[:, other - 1]
+        return q
 
 
 class SocketTable(NamedTable):
@@ -125,6 +133,8 @@ class _Table(NamedTable):
     readings: str | None = None  # file of the readings, in the same order
     readings_table: str | None = None  # in that file
     rotation: Annotated[str, AfterValidator(_rotation)] | None = None
+    plus: dict[str, Picked] = Field(default_factory=dict)  # columns added to those of an entry, such as deviations
+    minus: dict[str, Picked] = Field(default_factory=dict)  # and subtracted from them
     coverage_factor: PositiveFloat | None = None  # of the columns of u
 
 

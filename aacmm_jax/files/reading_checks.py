@@ -1,20 +1,33 @@
 """What a check of readings prints for a manifest: its table ``[angles]``, and ``units``."""
 
 import os
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import tomlkit
 
-from ..core.units import ANGLE_UNITS, LENGTH_UNITS, length_unit
+from ..core.units import ANGLE_UNITS, DEG, LENGTH_UNITS, length_unit
+from ..diagnostics.reading_check import ReadingCheck
 from ..diagnostics.reading_fit import Explanation
+from ..diagnostics.rotation_check import check_rotations
+from ..kinematics.arm import Arm
+from ..kinematics.corrections import coefficient_of
 from .inputs import InputFile
-from .manifest import readings_of_manifest
+from .manifest import WrittenRotations, readings_of_manifest
 from .manifest_tables import Angles
 from .reading_sets import pick, tables_of
 
+_OTHERS = 2  # conventions that do not fit and are shown
 
-def angles_toml(explanation: Explanation, unit: str | None, manifest: str | os.PathLike | None = None) -> str:
+
+def angles_toml(
+    explanation: Explanation,
+    unit: str | None,
+    manifest: str | os.PathLike | None = None,
+    couplings: Mapping[str, float] = MappingProxyType({}),
+) -> str:
     """The lines that make a manifest read the columns as an explanation of its readings has them.
 
     ``unit``, in which they were read; None: as the manifest or the header of its tables says. ``manifest``, with which
@@ -60,7 +73,48 @@ def angles_toml(explanation: Explanation, unit: str | None, manifest: str | os.P
         entries["sign"] = sign.astype(int).tolist()
     if np.any(offset):
         entries["offset"] = [round(x) if x == round(x) else x for x in offset.tolist()]
+    if couplings:
+        entries["coupled"] = {
+            str(term.joint): round(factor) * term.number
+            for name, factor in couplings.items()
+            if (term := coefficient_of(name)) is not None
+        }
     return tomlkit.dumps({"angles": entries}) + "".join(dict.fromkeys(comments))
+
+
+def rotation_rows(
+    manifest: str | os.PathLike, written: Sequence[WrittenRotations], check: ReadingCheck, arm: Arm
+) -> list[dict[str, Any]]:
+    """Of each table of orientations, the conventions that fit as well as the best, and the best of the others: how well
+    each fits, and the lines of the manifest."""
+    rows = []
+    tables = [table for key, table in tables_of(tomlkit.parse(InputFile(manifest).text)) if key == "transforms"]
+    hypothesis = check.best.hypothesis
+    for part in written:
+        q = hypothesis.readings(part.q[:, : arm.joints])
+        rms, fits = check_rotations(arm, q, hypothesis.length * part.points, part.numbers, part.unit)
+        stated = tables[part.table]
+        good = sum(fit.fits for fit in fits)
+        for fit in fits[: good + _OTHERS]:
+            lines = [f'rotation = "{fit.convention}"']
+            if fit.unit and not part.unit:
+                units = tomlkit.inline_table()
+                units.update({**stated.get("units", {}), "rotations": fit.unit})
+                lines.append(f"units = {units.as_string()}")
+            rows.append(
+                {
+                    "table": part.name,
+                    "rotation": fit.convention,
+                    "unit": fit.unit,
+                    "rms_mm": rms,
+                    "rms_deg": fit.rms / DEG,
+                    "fits": fit.fits,
+                    "equivalent": fit.equivalent,
+                    "taken": stated.get("rotation") == fit.convention,
+                    "lines": lines,
+                }
+            )
+    return rows
 
 
 def positions_unit(manifest: str | os.PathLike | None) -> str:

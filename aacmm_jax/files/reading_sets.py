@@ -21,6 +21,9 @@ _ROLES = {
 }
 _ROLE_OF = {word: role for role, words in _ROLES.items() for word in words.split()}
 _UNITS = {"deg", "rad", "degrees", "arcsec", "mm", "m"}
+_DEVIATIONS = {
+    *("dif", "diff", "difference", "deviation", "dev", "delta", "error", "err", "correction", "corr", "offset", "off")
+}
 _WORDS = re.compile(r"[A-Z]?[a-z]+|[A-Z]+|[0-9]+")
 
 
@@ -69,6 +72,44 @@ def other_readings(
         else:
             others.append(ReadingSet(role, capture, tuple(dict.fromkeys(lines))))
     return others[0] if taken and len(others) == 1 else None
+
+
+def deviations(header: Sequence[str]) -> list[list[str]]:
+    """Columns x, y and z of deviations, by name: those that a position may be lacking."""
+    families: dict[str, dict[str, str]] = {}
+    for name in header:
+        words = [word.casefold() for word in _WORDS.findall(name)]
+        axes = [word for word in words if word.removeprefix("d") in ("x", "y", "z")]
+        if len(axes) == 1 and (_DEVIATIONS & set(words) or axes[0][0] == "d"):
+            stem = " ".join("*" if word in axes else word for word in words)
+            families.setdefault(stem, {})[axes[0][-1]] = name
+    return [[axes[axis] for axis in "xyz"] for axes in families.values() if len(axes) == 3]
+
+
+def with_deviations(
+    manifest: InputFile, header: Sequence[str], read: Callable[[InputFile], Recording]
+) -> list[ReadingSet]:
+    """Of a manifest with measured points whose table has columns of deviations: the captures with these added to the
+    points and subtracted from them. ``header`` is that of its first table, and ``read`` reads a manifest."""
+    sets = []
+    for names in deviations(header):
+        for key in ("plus", "minus"):
+            changed = InputFile(manifest)
+            document = tomlkit.parse(changed.text)
+            tables = [table for kind, table in tables_of(document) if kind in ("points", "transforms")]
+            if not tables or any({"plus", "minus"} & set(table) for table in tables):
+                continue
+            picked = tomlkit.inline_table()
+            picked.update({"points": names})
+            for table in tables:
+                table[key] = picked
+            changed.content = tomlkit.dumps(document).encode()
+            try:
+                capture = read(changed).capture
+            except InputError:  # these columns are no numbers
+                continue
+            sets.append(ReadingSet(f"points {key} {', '.join(names)}", capture, (f"{key} = {picked.as_string()}",)))
+    return sets
 
 
 def tables_of(document: dict[str, Any]) -> Iterator[tuple[str, Any]]:

@@ -12,9 +12,10 @@ from ..calibration.results import Calibration, Identification
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.text import shorten
 from ..data.capture import Capture
-from ..data.recording import Recording
+from ..data.recording import ReadingSet, Recording
 from .single import calibrate, identify
 
+_COMPUTED = 1e-3  # mm: no instrument measures so well
 _APART = 3.0  # standard errors by which two residuals differ
 
 
@@ -41,6 +42,51 @@ def compare_reading_sets(recording: Recording) -> list[dict[str, Any]]:
             return _rows(recording, rms(recording.capture), rms(other.capture))
     except InputError:  # neither can be calibrated
         return []
+
+
+def compare_points(recording: Recording, others: Sequence[ReadingSet]) -> list[dict[str, Any]]:
+    """The measured points as the manifest has them, and other ways to read them, calibrated; the best first. Nothing
+    where there are no others, or none can be calibrated. ``computed`` are those that agree with the arm to rounding."""
+    if not others:
+        return []
+    bounds, rows = recording.nominal.bounds(), []
+    options: dict[str, Any] = {"shared_errors": False, "undetermined": "ignore"}
+    for role, capture, lines in (("points", recording.capture, ()), *others):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", IdentifiabilityWarning)
+                rms = float(calibrate(bounds.space.base, capture, bounds, **options).observed.rms)
+        except InputError:
+            continue
+        rows.append(
+            {"says": role, "lines": list(lines), "rms_mm": rms, "computed": rms < _COMPUTED, "taken": not lines}
+        )
+    measured = sorted((row for row in rows if not row["computed"]), key=lambda row: row["rms_mm"])
+    poses = len(recording.capture.readings)
+    return [
+        row | {"fits": not row["computed"] and not _differ(measured[0]["rms_mm"], row["rms_mm"], poses)}
+        for row in [*measured, *(row for row in rows if row["computed"])]
+    ]
+
+
+def points_sentence(rows: Sequence[dict[str, Any]]) -> str:
+    """Which points are measured, and what to write; empty where there is one way to read them."""
+    if not rows:
+        return ""
+    texts = [f"{row['says']}: {row['rms_mm']:.3g} mm RMS" for row in rows]
+    says = f"Calibrations with the columns of positions and deviations leave {'; '.join(texts)}."
+    computed = next((row for row in rows if row["computed"]), None)
+    if computed is not None:
+        says += (
+            f" Those of '{computed['says']}' agree with the arm to {computed['rms_mm']:.1g} mm: they were computed "
+            "from the readings, not measured."
+        )
+    fitting = [row for row in rows if row["fits"]]
+    if len(fitting) > 1:
+        says += f" {len(fitting)} ways fit equally well."
+    if fitting and not fitting[0]["taken"]:
+        says += f" Write in the table of the points: {' or '.join(row['lines'][0] for row in fitting if row['lines'])}."
+    return says
 
 
 def _rows(recording: Recording, taken: float, other: float) -> list[dict[str, Any]]:

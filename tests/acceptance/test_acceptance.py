@@ -543,7 +543,7 @@ def test_points_are_evaluated_without_an_arm(aacmm, tmp_path):
         (("shoulder = [0, 0, 0]", ""), "reach and shoulder are needed together"),
         (
             ('name = "{end}"', 'name = "{end}"\ntarget = "ball"'),
-            "target, session and temperature_C apply only to",
+            "target, session, temperature_C and load_kg apply only to",
         ),
     ],
 )
