@@ -170,7 +170,9 @@ def _evaluated(
         for observation, values in zip(observed.observations, residuals, strict=True):
             for unit, of_unit in by_unit.items():
                 seen = observation.other_unit == unit
-                of_unit.append(xp.sqrt(xp.mean(observation.other_sizes(values) ** 2)) if seen else xp.asarray(np.nan))
+                share = observation.other_counts / observation.other_counts.sum()
+                of_poses = observation.other_sizes(values) ** 2 if seen else xp.full(len(share), np.nan)
+                of_unit.append(xp.sqrt(xp.sum(share * of_poses)))
         described = ObservedEvaluation(
             names=tuple(observation.name for observation in observed.observations),
             kinds=tuple(observation.kind for observation in observed.observations),

@@ -20,6 +20,7 @@ from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.observations.observation import OTHER_UNITS
+from ..data.observations.pixels import Pixels
 from ..model.elimination import followed
 from ..model.layout import unknowns_of
 from ..model.observed import Observed
@@ -28,6 +29,7 @@ from ..uncertainty.kept_geometry import KeptGeometry, fitted_geometry, head_of
 from ..uncertainty.linearisation import Linearisation, ObservationRows
 from ..uncertainty.shared_kinds import SUCCESSIVE, VISITS
 from .evaluation import fit_geometry
+from .reprojection import reprojection
 from .task import without_lengths
 
 USED, HELD_OUT = "used", "held out"
@@ -50,7 +52,7 @@ class PoseResiduals(NamedTuple):
     residual: Float[np.ndarray, "m 3"]  # in the base frame, mm; of a distance or plane, along what it measures
     distance: Float[np.ndarray, " m"]  # of the tip from the geometry, mm; NaN for the only pose of a socket
     angle: Float[np.ndarray, " m"]  # size of the residuals that are measured in rad; NaN where there are none
-    pixels: Float[np.ndarray, " m"]  # of those in px
+    pixels: Float[np.ndarray, " m"]  # of those in px: root mean square distance of the corners of an image
     u: Float[np.ndarray, " m"]  # predicted standard uncertainty of ``distance``, mm
 
     def select(self, rows: Numbers) -> "PoseResiduals":
@@ -102,11 +104,14 @@ def residuals_by_pose(
     *derivatives, information = _derivatives(linear, held)
     of_used = _covariance_of_used(uncertainty, information[:model, :model])
     of_kept = np.zeros((0, 0)) if held is None else np.asarray(held.covariance)
-    rows = []
+    rows, found = [], observed.split(numbers)
     for part, by_parameters, by_geometry in zip(linear.parts(), *derivatives, strict=True):
         masks = used[part.poses], fitted[part.poses]
         derivatives = np.asarray(by_parameters), np.asarray(by_geometry)
-        rows.append(_of_part((uncertainty, of_used, of_kept), part, masks, *derivatives))
+        of_part = _of_part((uncertainty, of_used, of_kept), part, masks, *derivatives)
+        if isinstance(part.observation, Pixels):  # of the corners themselves
+            of_part = of_part._replace(pixels=reprojection(uncertainty.arm, part.observation, found).rms_by_image)
+        rows.append(of_part)
     return _concatenated(rows)
 
 

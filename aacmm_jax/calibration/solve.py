@@ -34,6 +34,8 @@ from .prior_fit import OfPrior, fitted_with_prior, weights
 from .results import Identification, ObservedMetrics
 from .task import Begun, Fit, State, Task, args_of, begin, fit, solves_of, state_after, whitening_at
 
+_MOST_STEPS = 100.0  # natural steps (mm, mrad, px): standard uncertainty from which a number is not determined
+
 
 class Solution(NamedTuple):
     """An identification, and what its uncertainty follows from."""
@@ -191,7 +193,10 @@ def _of_geometry(
 ) -> dict[str, Float[AnyArray, "_ _"]]:
     """Of each part, mm and rad; NaN for what the data leave open, such as the turn of a ball bar about itself."""
     xp, observed, p = namespace(linear.z), linear.observed, len(linear.space.names)
-    by_class = [(covariance.head[None, p:, p:], influence.determined[None, p:])]
+    # Number by number: what shares in a direction that is poorly determined has its own variance, which may be small.
+    of_head = covariance.head[p:, p:]
+    seen = (xp.diagonal(influence.null_projector)[p:] < 1e-6) & (xp.diagonal(of_head) < _MOST_STEPS**2)
+    by_class = [(of_head[None], seen[None])]
     by_class += [
         (matrix, ~is_open) for matrix, is_open in zip(covariance.components, influence.undetermined, strict=True)
     ]

@@ -1,11 +1,13 @@
 """What a camera cannot tell: a place along rotations about one axis, a focal length without tilt; and its noise."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from ..core.rotations import rotation_vector
+from ..core.text import listed
 from ..data.observations.pixels import Pixels
 from ..uncertainty.linearisation import ObservationRows
 from .equations import linearisation_of
@@ -29,7 +31,13 @@ def test(case: Case) -> list[Finding]:
     findings: list[Finding] = []
     for camera in cameras:
         turns = np.asarray(record.calibrated.arm.pose(np.asarray(camera.q)))[:, :3, :3]
-        found = _parallel(camera, turns), _focal(camera, record.observed), _scatter(camera, rows[camera.name])
+        u = _u_of_intrinsics(camera, record.observed)
+        found = (
+            _parallel(camera, turns),
+            _focal(camera, u),
+            _undetermined(camera, u),
+            _scatter(camera, rows[camera.name]),
+        )
         findings += [finding for finding in found if finding is not None]
     return findings
 
@@ -51,16 +59,34 @@ def _parallel(camera: Pixels, turns: Float[np.ndarray, "m 3 3"]) -> Finding | No
     )
 
 
-def _focal(camera: Pixels, metrics: Any) -> Finding | None:
-    """A focal length that the images do not show."""
-    names = [camera.camera_model.names[i] for i in camera.unsure]
-    if "fx" not in names:
+def _u_of_intrinsics(camera: Pixels, metrics: Any) -> dict[str, float]:
+    """Standard uncertainties of those that are not exact; NaN where the images do not determine one."""
+    return {
+        camera.camera_model.names[i]: float(np.sqrt(metrics.geometry_covariance[part][place, place]))
+        for part, places in camera.optical.items()
+        for place, i in enumerate(places)
+    }
+
+
+def _undetermined(camera: Pixels, u_of: Mapping[str, float]) -> Finding | None:
+    """Intrinsics that imitate each other in these images."""
+    names = [name for name, u in u_of.items() if not np.isfinite(u)]
+    if not names:
         return None
-    place = names.index("fx")
-    value, variance = (
-        metrics.geometry[camera.optics][place], metrics.geometry_covariance[camera.optics][place, place]
-    )  # fmt: skip
-    u = float(np.sqrt(variance) / value)
+    also = "; all others have their own U" if len(names) < len(u_of) else ", since all of them imitate each other"
+    return Finding(
+        "intrinsics-undetermined",
+        f"The images of '{camera.name}' do not determine {listed(names)} of '{camera.camera}' one by one{also}.",
+        "Only what they do to the corners together is determined.",
+        "Calibrate fewer distortion coefficients, state some of them, or let the target appear near the edges of the "
+        "image and at several tilts.",
+        concerns=(camera.name,),
+    )
+
+
+def _focal(camera: Pixels, u_of: Mapping[str, float]) -> Finding | None:
+    """A focal length that the images do not show."""
+    u = u_of.get("fx", 0.0) / float(camera.intrinsics[0]) if u_of else 0.0
     if u < _FOCAL_U:
         return None
     known = f"to {100 * float(rounded(u)):g} % only" if np.isfinite(u) else "not at all"

@@ -10,6 +10,7 @@ from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .culprits import Culprit, culprits_of
 from .determined import effect_of_bounds
 from .findings import Case, Finding, chance_text, rounded
+from .held_arm import errors_of_held
 from .missing_terms import FoundTerm, wider_model
 
 ORDER, NEEDS = 60, "fit"
@@ -23,7 +24,12 @@ def test(case: Case) -> list[Finding]:
         by_kind.setdefault(culprit.kind, []).append(culprit)
     # Of what bounds leave that parameters have reached.
     findings, beside_bounds = [], 1 - case.once(effect_of_bounds).share
+    if case.once(errors_of_held) is not None:  # `held_arm` says that of all parameters together
+        by_kind.pop("fixed", None)
+        by_kind["term"] = [c for c in by_kind.get("term", ()) if c.term is not None and c.term.kind != "zero"]
     for kind, culprits in by_kind.items():
+        if not culprits:
+            continue
         explains = min(sum(culprit.explains for culprit in culprits), 1.0) * beside_bounds
         if kind == "term":
             findings.append(_of_terms(case, [c.term for c in culprits if c.term is not None], explains))

@@ -8,8 +8,11 @@ from jaxtyping import Float, Int
 
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord
+from ..calibration.reprojection import reprojection
 from ..data.capture import Capture
 from ..data.observations.observation import AbstractObservation
+from ..data.observations.pixels import Pixels
+from ..uncertainty.linearisation import ObservationRows
 from .equations import equations_of, linearisation_of
 
 _LEAST_LEVER = 1e-6  # mm per rad: a joint whose axis the tip is on explains nothing
@@ -48,11 +51,7 @@ def observation_residuals(record: CalibrationRecord) -> tuple[ObservationResidua
             ObservationResiduals(
                 observation=observation,
                 distance=np.linalg.norm(position, axis=0),
-                other={
-                    unit: np.asarray(observation.other_sizes(np.asarray(part.values)))
-                    for unit in of_unit
-                    if unit != "mm"
-                },
+                other={unit: _other_sizes(record, part) for unit in of_unit if unit != "mm"},
                 normalised=np.sqrt(np.sum(white**2, axis=0) / observation.pose_equations),
                 weight=np.asarray(part.weight),
                 u={unit: float(np.sqrt(np.mean(variances[:, rows]))) for unit, rows in of_unit.items()},
@@ -61,6 +60,14 @@ def observation_residuals(record: CalibrationRecord) -> tuple[ObservationResidua
             )
         )
     return tuple(residuals)
+
+
+def _other_sizes(record: CalibrationRecord, part: ObservationRows) -> Float[np.ndarray, " m"]:
+    """Sizes of the residuals that are not in mm: of an image, the root mean square distance of its corners."""
+    observation = part.observation
+    if isinstance(observation, Pixels):
+        return reprojection(record.calibrated.arm, observation, record.observed.geometry).rms_by_image
+    return np.asarray(observation.other_sizes(np.asarray(part.values)))
 
 
 def distances_of(capture: Capture, evaluation: Evaluation) -> tuple[Float[np.ndarray, " m"], ...]:

@@ -89,7 +89,7 @@ def _of_residuals(case: Case) -> Finding:
 
 def likely_reason(case: Case) -> str:
     """What residuals that are larger than usual, and that no mistake in the readings explains, most likely come from:
-    bounds, a few poses, one observation, one joint, bending, or play."""
+    bounds, a few poses, one observation, an arm that was held, one joint, bending, or play."""
     record, capture = case.record, case.record.recording.capture
     # Bounds that nobody stated were widened as far as that helped.
     if (sides := on_bounds(record, final=True)) and "bounds" in record.recording.nominal.stated:
@@ -105,6 +105,8 @@ def likely_reason(case: Case) -> str:
     if squares[worst].sum() > _MOST * total and len(squares[worst]) < _MOST * sum(map(len, squares)):
         return f"errors in {names[worst]}"
     if not record.implausible_residual:
+        if not record.names:
+            return "errors of the arm's parameters, all of which were held"
         # What equations linear in the residuals tell, which must be small for that.
         noisiest = case.once(noisiest_joint)
         joints = [encoder.joint for encoder in record.noisy_encoders]

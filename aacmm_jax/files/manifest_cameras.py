@@ -80,6 +80,4 @@ class PixelsTable(NamedTable):
     def _one_kind_of_corners(self) -> "PixelsTable":
         if (self.images is None) == (self.corners is None):
             raise ValueError("needs either images or corners.")
-        if self.group is not None:
-            raise ValueError("group does not apply to pixels; remove it.")
         return self

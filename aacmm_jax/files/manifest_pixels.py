@@ -152,7 +152,7 @@ def by(size: Sequence[float]) -> str:
 def observations_of(
     cameras: Cameras, source: Source, entry: PixelsTable, values: Mapping[str, str], detecting: Detecting
 ) -> tuple[list[tuple[str, Pixels]], list[ReadImage]]:
-    """The observations of a table, one for each session, and what was found in each image."""
+    """The observations of a table, one for each session and group, and what was found in each image."""
     name = fill(entry.name or entry.camera, values)
     where = f"[[pixels]] '{name}'"
     with naming(where):
@@ -165,13 +165,16 @@ def observations_of(
         for part in taken:
             wanted = part.rows["image"].tolist() if "image" in part.rows else None
             if wanted is None and len(taken) > 1:
-                raise InputError("readings of several sessions need a column 'image' with the names of the images.")
+                raise InputError(
+                    "readings of several sessions or groups need a column 'image' with the names of the images."
+                )
             q = part.rows["q"]
             images = [
                 Seen("", *NO_CORNERS, "no corners are listed for this pose") if i < 0 else seen[i]
                 for i in matched([image.label for image in seen], wanted, len(q))
             ]
-            named = "/".join(filter(None, (part.session, name)))
+            of_group = name if entry.group is None else f"{name}/{part.group}"
+            named = "/".join(filter(None, (part.session, of_group)))
             read += [_read(named, image, image.refused) for image in images]
             used = [i for i, image in enumerate(images) if not image.refused]
             _check_once(q, images, used)
@@ -181,7 +184,8 @@ def observations_of(
                     labels.setdefault(image.refused, []).append(quoted(image.label))
                 reasons = [f"{shorten(of_reason, 1)}: {reason}" for reason, of_reason in labels.items()]
                 raise InputError(f"no image can be used ({shorten(reasons, 3)}); take other images, or correct these.")
-            observed.append((part.session, _pixels(name, entry, camera, target, q[used], [images[i] for i in used])))
+            chosen = [images[i] for i in used]
+            observed.append((part.session, _pixels(of_group, entry, camera, target, q[used], chosen)))
     named_images = {image.image for image in read}
     others = [image for image in seen if image.label not in named_images]
     return observed, [*read, *(_read(name, image, "no row of the readings names it") for image in others)]

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..calibration.reprojection import frame_of
 from ..core.errors import InputError, naming, require
 from ..core.text import csv_text
 from ..core.units import DEG
@@ -14,7 +15,6 @@ from ..data.capture import Capture
 from ..data.observations.observation import AbstractObservation
 from ..data.observations.pixels import Pixels
 from ..data.recording import Recording
-from ..diagnostics.reprojection import frame_of
 from ..kinematics.arm import by_joint
 from .kits import kit_targets, target_tables
 from .manifest_pixels import Progress, without_progress

@@ -18,7 +18,7 @@ from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.numpy_or_jax import compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
-from ..diagnostics import noisy_encoders, shared_errors
+from ..diagnostics import held_arm, noisy_encoders, shared_errors
 from ..diagnostics.findings import amendable
 from ..kinematics.arm import DOWN, Arm, correction_names, is_single, without_corrections
 from ..kinematics.corrected_arm import with_corrections
@@ -227,8 +227,9 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
         )
         if replaced is not result:
             return replaced
-    if case is not None and given.shared_errors and bounds.space.names:
-        result = shared_errors.amend(result, case, sensitivities)
+    if case is not None and given.shared_errors:
+        held = not bounds.space.names
+        result = held_arm.amend(result, case) if held else shared_errors.amend(result, case, sensitivities)
     return to_jax(result)
 
 

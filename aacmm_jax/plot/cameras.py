@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..calibration.record import CalibrationRecord
+from ..calibration.reprojection import Reprojection, reprojection
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray
 from ..core.text import pluralise
 from ..data.cameras.camera import AbstractCamera
 from ..data.observations.pixels import Pixels
-from ..diagnostics.reprojection import Reprojection, reprojection
 from ..kinematics.arm import Arm
 from ..summaries.tables import Table, by_columns, format_number, numbers
 from .arm import arm_poses

@@ -130,7 +130,7 @@ def pose_chart(
     ticks, edges = groups.parts()
     x = linear("pose" if len(groups.sizes) == 1 else f"pose, {groups.word} after {groups.word}",
                [0.0, len(last) + 1.0], margin=0.0)  # fmt: skip
-    y = {"standard deviations": "residual", "deg": "residual angle", "px": "distance in the image"}.get(
+    y = {"standard deviations": "residual", "deg": "residual angle", "px": "distance of an image's corners, RMS"}.get(
         unit, f"distance from the {groups.centre}"
     )
     plot = Plot(

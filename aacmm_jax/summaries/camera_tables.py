@@ -38,15 +38,37 @@ def camera_view(summary: Mapping[str, Any]) -> Iterator[str | Table]:
             f"{row['distance_mm']:.0f} mm away)."
         )
     yield mounts_table(rows, factor)
+    yield from _definitions(rows)
     intrinsics = intrinsics_table(rows, factor)
     if intrinsics.rows:
         yield intrinsics
 
 
+def _definitions(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """What mounts and places are relative to, where parameters that a camera cannot tell from them are held."""
+    frames = {row[kind]["of"]: (kind, row[kind]) for row in rows for kind in ("place", "mount")}
+    frames = {of: (kind, frame["defined_by"]) for of, (kind, frame) in frames.items() if frame["defined_by"]}
+    if frames:
+        held = [f"the {kind} of {of} from {' and '.join(names)}" for of, (kind, names) in frames.items()]
+        yield (
+            f"A camera cannot separate {' or '.join(held)}. These parameters are held at their nominal values, and U "
+            "does not contain their errors."
+        )
+    if frames and not any(row["tip_seen"] for row in rows):
+        yield (
+            "No observation shows the tip. Its place in the last frame (probe) is nominal, and U does not contain the "
+            "error of that; touch a socket in several poses to determine it."
+        )
+
+
 def shown_apart(summary: Mapping[str, Any]) -> list[Any]:
     """The parts of the geometry that the tables of cameras do not show."""
     names = {name for row in summary.get("cameras") or [] for name in (row["camera"], row["target"])}
-    said = {f"{what} of {name}" for what in ("frame", "offset", "orientation", "intrinsics") for name in names}
+    said = {
+        f"{what} of {name}"
+        for what in ("frame", "offset", "orientation", "intrinsics", "free intrinsics")
+        for name in names
+    }
     return [row for row in summary["geometry"] if row["part"] not in said]
 
 

@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ..calibration.record import CalibrationRecord
+from ..calibration.reprojection import frame_of, mount_of, reprojection
 from ..core.rotations import roll_pitch_yaw, rotation_and_derivative
 from ..data.observations.observation import offset_of
 from ..data.observations.pixels import Pixels
 from ..data.recording import Recording
-from ..diagnostics.reprojection import frame_of, mount_of, reprojection
 from .tables import plain
 
 
@@ -38,13 +38,13 @@ def camera_rows(record: CalibrationRecord) -> list[dict[str, Any]]:
 
     Of an arm from a URDF, mounts are in the tip link and places in the base link.
     """
-    rows = []
+    rows, arm = [], record.calibrated.arm
     geometry, covariances = record.observed.geometry, record.observed.geometry_covariance
     (base, first), (last, in_last) = _links(record)
     for observation in record.recording.capture.observations:
         if not isinstance(observation, Pixels):
             continue
-        seen = reprojection(record.calibrated.arm, observation, geometry)
+        seen = reprojection(arm, observation, geometry)
         moving, still = (observation.camera, observation.board)[:: 1 if observation.on_arm else -1]
         place = np.asarray(covariances[observation.frame])
         mount = _placed(
@@ -68,12 +68,20 @@ def camera_rows(record: CalibrationRecord) -> list[dict[str, Any]]:
             "reprojection_rms": seen.rms,
             "reprojection_rms_mm": float(np.sqrt(np.mean(seen.in_mm[seen.seen] ** 2))),
             "distance_mm": float(np.median(seen.distance[seen.seen])),
-            "mount": {"of": moving, "in": last} | mount,
-            "place": {"of": still, "in": base}
+            "mount": {"of": moving, "in": last, "defined_by": _held_of(record, arm.joints)} | mount,
+            "place": {"of": still, "in": base, "defined_by": _held_of(record, 1)}
             | _placed(first @ frame_of(frame), frame[:3], place[3:, 3:], place[:3, :3]),
+            "tip_seen": any(not part.target for part in record.recording.capture.parts),
             "intrinsics": _intrinsics(observation, seen.intrinsics, covariances),
         })  # fmt: skip
     return rows
+
+
+def _held_of(record: CalibrationRecord, joint: int) -> list[str]:
+    """The held parameters of the first or the last joint that move what is seen from there as a whole. None of an arm
+    that is held altogether, whose errors U contains as far as residuals show them."""
+    names = (f"theta_{joint}", f"d_{joint}")
+    return [name for name in names if record.names and name not in record.names]
 
 
 def _links(record: CalibrationRecord) -> tuple[tuple[str, np.ndarray], tuple[str, np.ndarray]]:
@@ -117,8 +125,8 @@ def _intrinsics(
 ) -> list[dict[str, Any]]:
     """The intrinsics with their standard uncertainty: 0 of those that are taken as exact."""
     u = np.zeros(len(values))
-    if observation.unsure:
-        u[list(observation.unsure)] = np.sqrt(np.diag(np.asarray(covariances[observation.optics])))
+    for part, places in observation.optical.items():
+        u[list(places)] = np.sqrt(np.diag(np.asarray(covariances[part])))
     model = observation.camera_model
     return [
         {"name": name, "unit": unit, "value": float(value), "u": plain(float(own))}

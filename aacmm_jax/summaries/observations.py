@@ -157,16 +157,22 @@ def residuals_csv(rows: PoseResiduals) -> str:
 def _agreement(pairs: Sequence[tuple[ObservationResiduals, np.ndarray]]) -> dict[str, Any]:
     """Root mean squares of some observations together, by the nominal and by the calibrated arm."""
     residuals = [part for part, _ in pairs]
-    others = {unit: [part.other[unit] for part in residuals if unit in part.other] for unit in OTHER_RMS}
+    others = {unit: [part for part in residuals if unit in part.other] for unit in OTHER_RMS}
     rows = np.concatenate([np.full(len(part.distance), part.observation.rows) for part in residuals])
     squares = np.concatenate([part.normalised for part in residuals]) ** 2
     return {
         "poses": len(rows),
         "rms_before_mm": rms(np.concatenate([distances for _, distances in pairs])),
         "rms_after_mm": rms(np.concatenate([part.distance for part in residuals])),
-        **{key: rms(np.concatenate(others[unit])) if others[unit] else None for unit, key in OTHER_RMS.items()},
+        **{key: _other_rms(others[unit], unit) if others[unit] else None for unit, key in OTHER_RMS.items()},
         "reduced_chi": float(np.sqrt(np.average(squares, weights=rows))),
     }
+
+
+def _other_rms(residuals: Sequence[ObservationResiduals], unit: str) -> float:
+    """Root mean square of residuals that are not in mm, over all corners of images."""
+    counts = np.concatenate([part.observation.other_counts for part in residuals])
+    return float(np.sqrt(np.average(np.concatenate([part.other[unit] for part in residuals]) ** 2, weights=counts)))
 
 
 def _geometry(capture: Capture, metrics: ObservedMetrics) -> list[dict[str, Any]]:

@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.calibration.redrawn import truth_of
+from aacmm_jax.calibration.reprojection import reprojection
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.data.cameras.views import calibrated_camera, started_intrinsics
 from aacmm_jax.data.observations.observation import Tips
+from aacmm_jax.diagnostics.pose_residuals import observation_residuals
+from aacmm_jax.kinematics.parameters import ArmSpecification
+from aacmm_jax.summaries.cameras import camera_rows
+from aacmm_jax.summaries.observations import observed_summary
 
 kinds = aj.data.observations
 LENS = (620.0, 615.0, 322.0, 241.0, -0.1, 0.05, 0.001, -0.001, 0.02)
@@ -25,6 +31,10 @@ NOISE = aj.Noise(encoder_arcsec=20.0, seating=0.02)
 def seen(name="eye", poses=15, on_arm=True, camera="webcam", board="board", **options):
     places = (ON_ARM | {"distance": (300, 500)}) if on_arm else (FIXED | {"distance": (300, 700)})
     return kinds.SimulatedPixels(name, poses, camera, board, BOARD, LENS, SIZE, on_arm=on_arm, **places | options)
+
+
+def record_of(result, capture):
+    return aj.calibration.record_of(result, aj.Recording(capture, ArmSpecification(TRUE)))
 
 
 def check_geometry(result, expected):
@@ -48,6 +58,33 @@ def test_hand_eye_with_an_exact_arm(on_arm):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("on_arm", [True, False], ids=["on the arm", "fixed"])
+def test_an_arm_that_is_held_and_errs_makes_the_mount_uncertain(on_arm):
+    """Zeros off by 0.2 deg, axes by 0.1 deg, lengths by 0.5 mm: the true mount is within U, which an exact arm's is not
+    near, and the residuals are said to show it."""
+    names = [f"{kind}_{i}" for kind in ("theta", "alpha", "a", "d") for i in range(1, 7)]
+    space, sizes = aj.Parameters(TRUE, tuple(names)), np.repeat([0.0035, 0.0017, 0.5], [6, 6, 12])
+    built = space.arm(np.asarray(space.vector()) + sizes * np.random.default_rng(3).normal(size=24))
+    held, places = ("webcam", ON_ARM) if on_arm else ("board", FIXED)
+    capture = aj.simulate(built, {}, observations=[seen(on_arm=on_arm)], noise=NOISE, seed=1)
+    result = aj.calibrate(TRUE, capture, NONE_FREE)
+    alone = aj.calibrate(TRUE, capture, NONE_FREE, shared_errors=False)
+    still = "board" if on_arm else "webcam"
+    expected = {f"offset of {held}": places["mount"][:3], f"orientation of {held}": places["mount"][3:]}
+    expected[f"frame of {still}"] = places["frame"]
+    ratios = []
+    for one in (result, alone):
+        parts, covariance = one.observed.geometry, one.observed.geometry_covariance
+        pairs = [(np.asarray(parts[part]) - value, np.diag(covariance[part])) for part, value in expected.items()]
+        ratios.append(np.concatenate([np.abs(error) / np.sqrt(variance) for error, variance in pairs]))
+    assert ratios[0].max() < 3.0 < ratios[1].max()
+    found = {finding.code: finding for finding in aj.diagnostics.findings_of(result, capture)}
+    assert "--arm-fixed" in found["held-arm"].advice
+    assert "px RMS off" in found["held-arm"].says
+    assert "wrong-fixed" not in found
+
+
+@pytest.mark.slow
 def test_two_cameras_and_two_boards_and_the_arm():
     """Cameras share what they name: here one board, and one camera."""
     other = (3.0, 0.0, 0.2, -600.0, 300.0, 20.0)
@@ -62,6 +99,59 @@ def test_two_cameras_and_two_boards_and_the_arm():
     check_geometry(result, {"offset of webcam": ON_ARM["mount"][:3], "offset of side": (-50.0, 20.0, 10.0)})
     ratio = (np.asarray(result.parameters) - np.asarray(space.vector(TRUE))) / np.sqrt(np.diag(result.covariance))
     assert np.abs(ratio).max() < 4.5
+
+
+@pytest.mark.slow
+def test_intrinsics_that_are_stated_and_free_ones_are_parts_of_their_own():
+    """A free one is no certified value, from which the found one may differ, and no equation."""
+    u = (1.0, 1.0, np.inf, np.inf, 0.01, 0.0, 0.0, 0.0, np.inf)
+    capture = aj.simulate(TRUE, {}, observations=[seen(u_intrinsics=u)], noise=EXACT, seed=1)
+    (eye,) = capture.observations
+    assert [*eye.certified] == ["intrinsics of webcam"]
+    assert np.asarray(eye.certified["intrinsics of webcam"][1]).tolist() == [1.0, 1.0, 0.01]
+    result = aj.calibrate(TRUE, capture, NONE_FREE)
+    check_geometry(result, {"intrinsics of webcam": [LENS[i] for i in (0, 1, 4)]})
+    check_geometry(result, {"free intrinsics of webcam": [LENS[i] for i in (2, 3, 8)]})
+    (row,) = camera_rows(record_of(result, capture))
+    assert [entry["u"] > 0 for entry in row["intrinsics"]] == [one > 0 for one in u]
+
+
+@pytest.mark.slow
+def test_poorly_determined_coefficients_leave_the_others_their_u():
+    """Radial coefficients of a quotient imitate each other; focal lengths and centre have their own u."""
+    lens = (*LENS[:8], 0.02, 0.0, 0.0, 0.0)
+    eye = kinds.SimulatedPixels("eye", 20, "webcam", "board", BOARD, lens, SIZE, u_intrinsics=np.inf,
+                                **ON_ARM | {"distance": (250, 500)})  # fmt: skip
+    capture = aj.simulate(TRUE, {}, observations=[eye], noise=EXACT, seed=1)
+    result = aj.calibrate(TRUE, capture, NONE_FREE)
+    u = np.sqrt(np.diag(result.observed.geometry_covariance["intrinsics of webcam"]))
+    error = np.abs(np.asarray(result.observed.geometry["intrinsics of webcam"]) - lens)
+    np.testing.assert_array_equal(np.isnan(u), np.isin(np.arange(12), (4, 5, 8, 9, 10, 11)))
+    assert np.all(error[:4] < 4.5 * u[:4])
+    assert np.all(u[:4] < 5.0)
+    found = {finding.code: finding.says for finding in aj.diagnostics.findings_of(result, capture)}
+    assert "k1, k2, k3, k4, k5 and k6 of 'webcam'" in found["intrinsics-undetermined"]
+
+
+@pytest.mark.slow
+def test_residuals_in_pixels_are_those_of_the_corners():
+    """Whatever each corner's standard deviation, and however many an image has."""
+    (eye,) = aj.simulate(TRUE, {}, observations=[seen(poses=8)], noise=NOISE, seed=1).observations
+    u = np.random.default_rng(0).uniform(0.1, 0.9, np.shape(eye.corners))
+    ids = np.array(eye.ids)
+    ids[2, 6:] = -1
+    capture = aj.Capture({}, observations=[eye.changed(u=u).changed(ids=tuple(map(tuple, ids.tolist())))])
+    result = aj.calibrate(TRUE, capture, NONE_FREE)
+    record = record_of(result, capture)
+    corners = reprojection(record.calibrated.arm, capture.observations[0], record.observed.geometry)
+    counts = corners.seen.sum(axis=1)
+    assert counts.tolist() == [20, 20, 6, 20, 20, 20, 20, 20]
+    expected = np.sqrt(np.sum(corners.residual**2, axis=(1, 2)) / counts)
+    (part,) = observation_residuals(record)
+    np.testing.assert_allclose(part.other["px"], expected)
+    np.testing.assert_allclose(aj.residuals_of(record).pixels, expected, rtol=1e-6)
+    (row,) = observed_summary(record, record.evaluations()["nominal"])["observations"]
+    assert row["rms_px"] == pytest.approx(corners.rms)
 
 
 def test_an_uncertain_scale_of_the_target_is_carried_into_all_lengths():
@@ -162,3 +252,22 @@ def test_bad_cameras(fields, message):
     stored = {name: value for name, value in stored.items() if name != "u_intrinsics"}
     with pytest.raises(aj.InputError, match=message):
         kinds.Pixels.rebuilt("eye", stored)
+
+
+@pytest.mark.slow
+def test_trials_drawn_anew_scatter_as_the_covariance_says():
+    """With stated, free and exact intrinsics and an uncertain scale, which a batch has as parts of its own too."""
+    options = {"u_intrinsics": (1.0, 1.0, np.inf, np.inf, 0.01, 0.0, 0.0, 0.0, 0.0), "u_scale": 1e-4}
+    capture = aj.simulate(TRUE, {}, observations=[seen(**options)], noise=NOISE, seed=2)
+    space = aj.Parameters(TRUE, ("theta_2", "theta_3", "a_2"))
+    bounds = aj.Bounds.around(TRUE, space)
+    result = aj.calibrate(TRUE, capture, bounds, noise=NOISE, undetermined="ignore")
+    drawn, _ = truth_of(result, capture).drawn(200, NOISE, np.random.default_rng(0))
+    many = aj.calibrate_many(result.arm, drawn, bounds, noise=NOISE)
+    u = np.sqrt(np.diag(result.covariance))
+    error = np.asarray(many.parameters) - np.asarray(result.parameters)
+    np.testing.assert_allclose(error.std(axis=0), u, rtol=0.2)
+    assert np.all(np.abs(error.mean(axis=0)) < 4 * u / np.sqrt(200))
+    # Of poses drawn with replacement.
+    sampled = aj.bootstrap(result, capture, trials=100)
+    np.testing.assert_allclose(sampled.u[:3], u, rtol=0.6)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.calibration.reprojection import frame_of
 from aacmm_jax.data.cameras.camera import camera_models
-from aacmm_jax.diagnostics.reprojection import frame_of
 
 from ..conftest import EXAMPLES
 

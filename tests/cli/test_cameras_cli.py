@@ -61,6 +61,15 @@ def test_a_camera_that_stands_still(aacmm, folder):
     assert aacmm("export", "c.h5", "--format", "matrix", "--frame", "place").stdout.startswith("# webcam in base, mm")
 
 
+@pytest.mark.slow
+def test_what_a_camera_cannot_separate_is_said(aacmm, folder):
+    """Zeros of the first and last joint from place and mount, and the tip; not where the arm is held altogether."""
+    for options, said in ((("--no-automatic",), True), (("--arm-fixed",), False)):
+        shown = " ".join(aacmm("calibrate", folder / "on-arm.h5", "-o", "c.h5", *options).stdout.split())
+        assert ("the place of board from theta_1 and d_1 or the mount of webcam from theta_6." in shown) is said
+        assert ("No observation shows the tip." in shown) is said
+
+
 def test_nothing_but_the_arm_is_refused(aacmm, folder):
     said = aacmm("calibrate", folder / "on-arm.h5", "-o", "c.h5", "--arm-fixed", "--free", "beta_2", expect=2).stderr
     assert "--arm-fixed" in said

@@ -11,6 +11,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.camera import detection
 from aacmm_jax.data.cameras.camera import camera_models
+from aacmm_jax.pipeline.hold_out import held_out_poses, without_held_out
 from tests.refusals import assert_refused
 
 TARGET = '[[target]]\nname = "board"\nkind = "charuco"\nsquares = [6, 5]\nsize = 30.0\nmarker = 22.0\n'
@@ -73,6 +74,22 @@ def test_a_table_of_corners_is_read_and_comes_back_from_a_file(tmp_path, seen, i
     for name in ("q", "corners", "points", "u", "intrinsics", "u_intrinsics", "views"):
         np.testing.assert_array_equal(getattr(loaded.capture.observations[0], name), getattr(pixels, name))
     assert loaded.capture.observations[0].ids == pixels.ids
+
+
+def test_a_column_divides_the_images_into_groups(tmp_path, seen):
+    """Observations of one camera and one target, which can be held out by name."""
+    files(tmp_path, seen)
+    lines = (tmp_path / "joints.csv").read_text().splitlines()
+    places = ["place", *("left" if i % 3 else "right" for i in range(len(seen.q)))]
+    (tmp_path / "joints.csv").write_text("\n".join(f"{a},{b}" for a, b in zip(lines, places, strict=True)))
+    recording = read(tmp_path, changes=[('corners = "corners.csv"\n', 'corners = "corners.csv"\ngroup = "place"\n')])
+    right, left = recording.capture.observations
+    assert [part.name for part in (right, left)] == ["webcam/right", "webcam/left"]
+    assert (right.camera, right.board) == (left.camera, left.board) == ("webcam", "board")
+    np.testing.assert_allclose(right.corners, np.asarray(seen.corners)[::3], atol=1e-6)
+    assert [image.observation for image in recording.images].count("webcam/left") == len(left.q)
+    kept = without_held_out(recording.capture, held_out_poses(recording.capture, "webcam/right", None, 0))
+    assert [part.name for part in kept.observations] == ["webcam/left"]
 
 
 @pytest.mark.parametrize("lists", ["all", "ids", "points", "plain", "records"])

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.calibration.reprojection import reprojection
 from aacmm_jax.data.cameras.camera import camera_models
-from aacmm_jax.diagnostics.reprojection import reprojection
 from aacmm_jax.plot import cameras
 from tests.refusals import assert_refused
 

@@ -188,6 +188,11 @@ class AbstractObservation(Declared):
         xp = namespace(rows)
         return xp.sqrt(xp.sum(rows[self.lengths :] ** 2, axis=0))
 
+    @property
+    def other_counts(self) -> Int[np.ndarray, " m"]:
+        """How many things, such as corners, each of `other_sizes` is the root mean square of."""
+        return np.ones(self.q.shape[-2], dtype=int)
+
     def in_mm(self, rows: Float[AnyArray, "r *k m"], by_tip: Float[AnyArray, "r 3 m"]) -> Float[AnyArray, "c *k m"]:
         """Residuals, or their derivatives by k numbers, as a vector whose length is the distance of the tip from the
         geometry, mm: the residuals in mm themselves; of a kind without any, the shortest displacement of the tip that

@@ -1,7 +1,7 @@
 """What a camera saw: corners of known points of a target, with the camera or the target on the arm."""
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -63,9 +63,11 @@ class Pixels(AbstractObservation):
     kind, table, rotates, reduces = "pixels", "pixels", True, True
     stacks, eliminates = False, False
     fixes_scale = True
-    derived = ("still", "unsure")
+    derived = ("still", "uncertain", "free", "scaled")
     still: str  # what is not on the arm
-    unsure: tuple[int, ...]  # which intrinsics are not exact
+    uncertain: tuple[int, ...]  # which intrinsics have an uncertainty
+    free: tuple[int, ...]  # and which are only a start
+    scaled: bool  # whether the target's scale is uncertain
     corners: Float[AnyArray, "m c d"] = declared(
         "measured corner", "px", "pose", "corner", "image_axis", more="mm of a camera that measures points in space"
     )
@@ -97,7 +99,8 @@ class Pixels(AbstractObservation):
     images: tuple[str, ...] | None = declared("name of the image", "", "pose", default=None)
     frame = Part("frame of {still}", *FRAME)
     orientation = Part("orientation of {target}", *FRAME[:3])
-    optics = Part("intrinsics of {camera}")  # of those that are not exact
+    optics = Part("intrinsics of {camera}")  # of those that are not exact; where some are free, those that are stated
+    free_optics = Part("free intrinsics of {camera}")  # beside stated ones
     scale = Part("scale of {board}", "1")
 
     def completed(self, where: str) -> Mapping[str, Any]:
@@ -117,7 +120,7 @@ class Pixels(AbstractObservation):
             raise InputError(f"{where} has no corner in pose {empty + 1}; leave out this pose.")
         if is_concrete(self.u) and np.any(np.asarray(self.u)[present] <= 0):
             raise InputError(f"u of {where} is 0; give the standard deviation of a corner, such as 0.3 px.")
-        unsure = np.flatnonzero(np.asarray(u) > 0) if is_concrete(u) else np.arange(len(u))
+        unsure, known = np.asarray(u) > 0 if is_concrete(u) else np.ones(len(u), dtype=bool), is_known(u)
         target, still = sides if self.on_arm else sides[::-1]
 
         def absent(values: AnyArray, value: float) -> AnyArray:
@@ -129,7 +132,9 @@ class Pixels(AbstractObservation):
             "u": absent(self.u, 1.0),
             "target": target,
             "still": still,
-            "unsure": tuple(int(i) for i in unsure),
+            "uncertain": tuple(np.flatnonzero(unsure & known).tolist()),
+            "scaled": not is_exact(self.u_scale),
+            "free": tuple(np.flatnonzero(unsure & ~known).tolist()),
         }
         if is_concrete(fields["corners"], fields["points"], fields["u"], self.intrinsics, u):
             made = self.changed(**fields)
@@ -215,46 +220,47 @@ class Pixels(AbstractObservation):
 
     @property
     def row_units(self) -> tuple[str, ...]:
-        return (self.camera_model.unit,) * (7 + len(self._own_units))
+        own = len(self.uncertain) + len(self.free) + self.scaled  # that do not move the target as a whole
+        return (self.camera_model.unit,) * (7 + own)
 
     @property
-    def _own_units(self) -> tuple[str, ...]:
-        """Of the unknowns that do not move the target as a whole."""
-        own = tuple(self.camera_model.units[i] for i in self.unsure)
-        return own if is_exact(self.u_scale) else (*own, "1")
+    def optical(self) -> Mapping[str, tuple[int, ...]]:
+        """Which intrinsics the parts of the geometry hold that are intrinsics."""
+        if self.uncertain and self.free:
+            return {self.optics: self.uncertain, self.free_optics: self.free}
+        return {self.optics: self.uncertain or self.free} if self.uncertain or self.free else {}
+
+    def _by_part(self, values: Sequence[Any]) -> dict[str, tuple[Any, ...]]:
+        return {part: tuple(values[i] for i in places) for part, places in self.optical.items()}
 
     @property
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
-        parts = {self.frame: FRAME, self.orientation: FRAME[:3]}
-        if self.unsure:
-            parts[self.optics] = tuple(self.camera_model.units[i] for i in self.unsure)
-        if not is_exact(self.u_scale):
-            parts[self.scale] = ("1",)
-        return parts
+        scale = {self.scale: ("1",)} if self.scaled else {}
+        frames = {self.frame: FRAME, self.orientation: FRAME[:3]}
+        return frames | self._by_part(self.camera_model.units) | scale
 
     @property
     def apart(self) -> tuple[str, ...]:
-        return tuple(name for name in (self.optics, self.scale) if name in self.unknowns)
+        return tuple(name for name in self.unknowns if name not in (self.frame, self.orientation))
 
     @property
     def steps(self) -> Mapping[str, tuple[float, ...]]:
-        steps = self.camera_model.steps
-        return {self.optics: tuple(steps[i] for i in self.unsure)} if self.unsure else {}
+        return self._by_part(self.camera_model.steps)
 
     @property
     def certified(self) -> Certified:
         values: Certified = {}
-        index = np.array(self.unsure, dtype=int)
-        if is_known(self.u_intrinsics[index]).any():
+        if self.uncertain:
+            index = np.array(self.uncertain)
             values[self.optics] = (self.intrinsics[index], self.u_intrinsics[index])
-        if not is_exact(self.u_scale):
+        if self.scaled:
             values[self.scale] = (np.ones(1), namespace(self.u_scale).reshape(self.u_scale, (1,)))
         return values
 
     def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
-        if part == self.optics:
+        if part in self.optical:
             model = self.camera_model
-            named = zip(self.unsure, values, strict=True)
+            named = zip(self.optical[part], values, strict=True)
             return tuple(Quantity(model.names[i], np.reshape(value, 1), model.units[i]) for i, value in named)
         return super().quantities(part, values)
 
@@ -262,20 +268,27 @@ class Pixels(AbstractObservation):
         made = super().in_session(session, probe)
         return made.changed(still=f"{session}/{self.still}")
 
+    @property
+    def other_counts(self) -> Int[np.ndarray, " m"]:
+        return self.seen.sum(axis=1)
+
     def other_sizes(self, rows: Float[AnyArray, "r m"]) -> Float[AnyArray, " m"]:
-        return super().other_sizes(rows) / namespace(rows).asarray(np.sqrt(self.seen.sum(axis=1)))
+        return super().other_sizes(rows) / namespace(rows).asarray(np.sqrt(self.other_counts))
 
     def in_mm(self, rows: Float[AnyArray, "r *k m"], by_tip: Float[AnyArray, "r 3 m"]) -> Float[AnyArray, "c *k m"]:
         return displacement(rows, by_tip)
 
-    def whole_intrinsics(self, of_part: Float[AnyArray, "j p"] | None) -> Float[AnyArray, "k p"]:
-        """All intrinsics as columns, with those of the unknown part."""
-        exact = self.intrinsics[:, None]
-        if of_part is None:
-            return exact
-        xp, places = namespace(exact, of_part), {i: place for place, i in enumerate(self.unsure)}
-        columns = [of_part[places[i]] if i in places else exact[i] + 0 * of_part[0] for i in range(len(exact))]
-        return xp.stack(columns)
+    def whole_intrinsics(self, unknowns: Unknowns) -> Float[AnyArray, "i _"]:
+        """All intrinsics as columns, with the unknown ones."""
+        columns = list(self.intrinsics[:, None])
+        for part, places in self.optical.items():
+            for place, value in zip(places, unknowns[part], strict=True):
+                columns[place] = value
+        wide = max((column.shape[0] for column in columns), default=1)
+        xp = namespace(columns)
+        return (
+            xp.stack([xp.broadcast_to(column, (wide,)) for column in columns]) if columns else self.intrinsics[:, None]
+        )
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
         assert self.views is not None  # see `completed`
@@ -289,8 +302,7 @@ class Pixels(AbstractObservation):
         origins = tips.position - xp.einsum("cpm,p->cm", axes, offset)
         place, turn, frame = hand_eye(origins, axes, turns, shifts, counted)
         parts = {self.frame: frame, self.orientation: turn, offset_of(self.target): place}
-        if self.unsure:
-            parts[self.optics] = self.intrinsics[np.array(self.unsure)]
+        parts |= {part: self.intrinsics[np.array(places)] for part, places in self.optical.items()}
         return parts | {name: value for name, (value, _) in self.certified_values().items()}
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
@@ -308,7 +320,7 @@ class Pixels(AbstractObservation):
         arms = turned if scale is None else turned * scale[None, :, None]
         sight = arms + between[:, :, None]
         camera = xp.broadcast_to(camera, (3, 3, m))
-        intrinsics = self.whole_intrinsics(unknowns.get(self.optics))[:, :, None]
+        intrinsics = self.whole_intrinsics(unknowns)[:, :, None]
         seen = self.camera_model.project(xp.einsum("ijm,imc->jmc", camera, sight), intrinsics)
         # By a shift of the target in the base frame, (3, d, m, c); all other derivatives follow from these.
         by_shift = xp.einsum("djmc,ijm->idmc", seen.by_point, camera)
@@ -322,8 +334,7 @@ class Pixels(AbstractObservation):
             ),
             self.orientation: xp.einsum("ikm,idmc->kdmc", inside, by_carried),
         }
-        if self.unsure:
-            by[self.optics] = seen.by_intrinsics[np.array(self.unsure)]
+        by |= {part: seen.by_intrinsics[np.array(places)] for part, places in self.optical.items()}
         if self.scale in unknowns:
             by[self.scale] = xp.sum(by_shift * turned[:, None], axis=0)[None]
         present = xp.asarray(self.seen)

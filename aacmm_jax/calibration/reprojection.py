@@ -30,6 +30,11 @@ class Reprojection(NamedTuple):
         return float(np.sqrt(np.sum(self.residual**2) / self.seen.sum()))
 
     @property
+    def rms_by_image(self) -> Float[np.ndarray, " m"]:
+        """The same of each image."""
+        return np.sqrt(np.sum(self.residual**2, axis=(1, 2)) / self.seen.sum(axis=1))
+
+    @property
     def in_mm(self) -> Float[np.ndarray, "m c"]:
         """The same distances at the target, across the line of sight, mm."""
         sizes = np.linalg.norm(self.residual, axis=2)
@@ -64,7 +69,7 @@ def reprojection(arm: Arm, observation: Pixels, geometry: Mapping[str, Float[Any
     scale = float(np.asarray(geometry[observation.scale])[0]) if observation.scale in unknowns else 1.0
     points = scale * np.asarray(observation.points) @ board[:, :3, :3].swapaxes(1, 2) + board[:, None, :3, 3]
     distance = np.linalg.norm(points - camera[:, None, :3, 3], axis=2)
-    intrinsics = observation.whole_intrinsics(unknowns.get(observation.optics))[:, 0]
+    intrinsics = observation.whole_intrinsics(unknowns)[:, 0]
     return Reprojection(
         measured, -values, np.asarray(observation.seen), distance, np.asarray(intrinsics), camera, board
     )
