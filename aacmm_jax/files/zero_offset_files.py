@@ -160,8 +160,6 @@ def _entries(
     names = [name for name, _ in chosen]
     unknown = [name for name in names if name not in known]
     if unknown or len(names) != joints or len(set(names)) != joints:
-        said = (
-            f"there is no {what} {quoted(unknown[0])}" if unknown else f"{joints} joints need as many different names"
-        )
+        said = f"there is no {what} {quoted(unknown[0])}" if unknown else f"{joints} joints need as many names"
         raise InputError(f"{said}; name one {what} per joint (--motors) of those in the file: {shorten(known, 12)}.")
     return chosen

@@ -88,8 +88,8 @@ def by_mujoco(text: str, tip: str, base: str = "world") -> np.ndarray:
     data = mujoco.MjData(model)
 
     def frame(name: str) -> np.ndarray:
-        sites = [model.site(i).name for i in range(model.nsite)]
-        place = data.site(name) if name in sites else data.body(name)
+        bodies = [model.body(i).name for i in range(model.nbody)]
+        place = data.body(name) if name in bodies else data.site(name)
         transform = np.eye(4)
         transform[:3, :3], transform[:3, 3] = place.xmat.reshape(3, 3), 1000 * place.xpos
         return transform
