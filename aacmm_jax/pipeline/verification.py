@@ -232,10 +232,11 @@ def _stacked(linear: Linearisation) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     """All rows in standard deviations, their derivatives, and the pose of each; reference lengths and certified values
     have numbers of their own."""
     values, columns, pose, first = [], [], [], 0
-    for white, derivative in zip(linear.white(), linear.dense(), strict=True):
+    for part, derivative in zip(linear.parts(), linear.dense(), strict=True):
+        white = part.without_rest().white  # a last row that stands for the noise of many corners knows no arm
         rows, poses = white.shape
         values.append(np.asarray(white).T.ravel())
-        columns.append(np.asarray(derivative).transpose(2, 1, 0).reshape(rows * poses, -1))
+        columns.append(np.asarray(derivative)[:, :rows].transpose(2, 1, 0).reshape(rows * poses, -1))
         pose.append(np.repeat(first + np.arange(poses), rows))
         first += poses
     derivatives, errors, u = linear.relations()

@@ -33,7 +33,7 @@ def recording(nominal, true, poses=8, lengths=(), sockets="ABC"):
 
 @pytest.mark.parametrize(
     ("true", "other", "verdict"),
-    [(1.0, 0.2, "better"), (1.0, 0.0, "better"), (-1.0, 0.0, "worse"), (0.0, 2.0, "worse"), (0.5, 0.8, "not decided")],
+    [(1.0, 0.2, "better"), (1.0, 0.0, "better"), (-1.0, 0.0, "worse"), (0.0, 4.0, "worse"), (0.5, 0.8, "not decided")],
 )
 def test_verdicts(true, other, verdict):
     nominal, real, delivered = arms(1, true, other)
@@ -52,6 +52,21 @@ def test_poses_in_one_place_do_not_decide_about_the_working_volume():
     checked = aj.verify(recording(nominal, real, sockets="AB"), delivered)
     assert (checked.verdict, checked.verdict_here) == ("not decided", "worse")
     assert "Record poses in other places" in verification_summary(checked, "", "")["poses_say"]
+
+
+def test_a_board():
+    """The noise of many corners knows no arm, and is not taken for that of the poses."""
+    nominal, real, delivered = arms(1, 1.0, 0.2)
+    grid = [(40.0 * i, 40.0 * j, 0.0) for j in range(3) for i in range(4)]
+    lens = (620.0, 615.0, 322.0, 241.0, -0.1, 0.05, 0.001, -0.001, 0.02)
+    eye = aj.data.observations.SimulatedPixels(
+        *("eye", 12, "webcam", "board", grid, lens, (640, 480)), on_arm=True, distance=(250, 450), u=0.2,
+        frame=(3.08, 0.1, 0.0, -400.0, -150.0, 0.0), mount=(60.0, -10.0, 20.0, 0.0, 0.0, 0.3),
+    )  # fmt: skip
+    capture = aj.simulate(real, {}, observations=[eye], noise=aj.Noise(encoder_arcsec=5.0, seating=0.03), seed=1)
+    checked = aj.verify(aj.Recording(capture, ArmSpecification(nominal, "")), delivered)
+    assert (checked.verdict, checked.poses) == ("better", 12)
+    assert checked.recalibrated < checked.nominal.rms
 
 
 def test_exchanged_arms_have_the_opposite_verdict():
