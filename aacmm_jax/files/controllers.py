@@ -57,7 +57,13 @@ _ENOUGH = 30  # steps of Gauss and Newton, of which some five are needed
 
 
 class ZeroOffsets(NamedTuple):
-    """The zero offsets of the joints with which the nominal arm comes closest to a calibrated one."""
+    """The zero offsets of the joints with which the nominal arm comes closest to a calibrated one.
+
+    Example:
+        >>> zeros = aj.files.ZeroOffsets(np.array([0.01]), ("rad",), np.zeros(3), 1.0, 0.1, 0.2)
+        >>> print(aj.files.zero_offsets_csv(zeros).splitlines()[-1])
+        1,0.5729577951308232,0.01
+    """
 
     offsets: Float[np.ndarray, " n"]  # to add to the readings, rad, or mm of prismatic joints
     units: tuple[str, ...]  # of each, rad or mm

@@ -8,8 +8,8 @@ from .collisions import HalfSpace as HalfSpace
 from .collisions import Post as Post
 from .collisions import body_along_links as body_along_links
 from .collisions import clearances as clearances
+from .commanded_poses import corrected_targets as corrected_targets
 from .corrected_arm import with_corrections as with_corrections
-from .corrected_targets import corrected_targets as corrected_targets
 from .inverse_kinematics import corrected_readings as corrected_readings
 from .inverse_kinematics import project_to_targets as project_to_targets
 from .inverse_kinematics import readings_at_poses as readings_at_poses

@@ -101,7 +101,7 @@ def test_poses_for_a_controller_that_takes_nothing_else(arms, given):
     """The controller finds readings with the nominal arm; with them, the calibrated arm is where it was wanted."""
     folder, nominal, calibrated = arms
     q = Q[:1] + 0.02 * np.arange(3)[:, None]
-    wanted = np.asarray(nominal.pose(q))
+    wanted = np.array(nominal.pose(q))
     wanted[:, :3, :3] = wanted[:1, :3, :3] if given == "points" else wanted[:, :3, :3]
     near = f"--near={','.join(str(x) for x in Q[0] / DEG)}"
     if given == "readings":
