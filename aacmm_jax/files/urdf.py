@@ -206,7 +206,7 @@ def urdf_of(arm: Arm, nominal: ArmSpecification) -> ExportedUrdf:
     wanted = {"joints": single(arm).joints, "chains": [name for name, _ in arm.chains]}
     if wanted != {"joints": nominal.arm.joints, "chains": [name for name, _ in nominal.arm.chains]}:
         raise InputError(
-            f"the arm has {arm.joints} joints, but that of the file has {nominal.arm.joints}; give an arm that was "
+            f"the arm has {arm.joints} joints, but the chain has {nominal.arm.joints}; give an arm that was "
             "calibrated from this file."
         )
     if not arm.chains:
