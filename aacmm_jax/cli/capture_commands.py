@@ -11,7 +11,6 @@ from ..core.errors import InputError
 from ..core.text import quoted
 from ..core.units import DEG
 from ..files.inputs import ROBOT_FILES, InputFile
-from ..files.manifest import written_rotations
 from ..files.outputs import together
 from . import options, views
 from .app import command, progress_bar, read_with_progress, show_summary, tracked, with_spinner
@@ -205,6 +204,8 @@ def import_(
     with together(output):
         written = []
         if check and output is None and "[[transforms]]" in InputFile(manifest).text:
+            from ..files.manifest import written_rotations
+
             recording, written = written_rotations(manifest)
         else:
             recording = read_with_progress(manifest, overlays)

@@ -322,7 +322,7 @@ def _rotated(cosine: Any, sine: Any, angle: Array) -> tuple[Array, Array]:
 
 def _tip(links: Geometry, twist: tuple[Array, Array], joints: JointMotion) -> tuple[Array, ...]:
     """The tip alone, from the probe back to the base: one vector instead of a frame."""
-    (cos_twist, sin_twist), (x, y, z), (cosine, sine, slide, _) = twist, links.probe, joints
+    (cos_twist, sin_twist), (x, y, z), (cosine, sine, slide, *_) = twist, links.probe, joints
     for i in reversed(range(cosine.shape[0])):
         if links.beta is not None:
             cos_tilt, sin_tilt = jnp.cos(links.beta[i]), jnp.sin(links.beta[i])

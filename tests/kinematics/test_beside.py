@@ -26,7 +26,7 @@ BOTH = ("directions", "thermometer")
 def test_columns_are_told_by_their_number(recorded, possible, columns, names):
     beside = Beside(6, recorded, possible)
     assert beside.names(columns) == names
-    parts = beside.split(np.arange(columns)[:, None])
+    parts = beside.split(np.arange(float(columns))[:, None])
     shown = [parts.joints, *(getattr(parts, name) for name in names)]
     np.testing.assert_array_equal(np.concatenate(shown)[:, 0], np.arange(columns))
     assert all(getattr(parts, name) is None for name in set(ALL) - set(names))

@@ -245,6 +245,6 @@ def test_default_models_of_a_capture_with_temperatures(paper_arm, space):
     capture = sockets(paper_arm, space)
     assert default_models(paper_arm, capture) == DEFAULT_MODELS
     warm = {name: np.pad(q, ((0, 0), (0, 1)), constant_values=21.0) for name, q in capture.sockets.items()}
-    found = default_models(paper_arm, aj.Capture(warm))
+    found = default_models(paper_arm.replace(thermometer=True), aj.Capture(warm))
     assert found[:4] == ("dh", "expansion", "gravity", "gravity,expansion")
     assert len(found) == 2 * len(DEFAULT_MODELS)
