@@ -178,7 +178,7 @@ def _text(record: Any, specification: Any, form: str, calibrated: bool) -> str:
     return files.python_program(specification.arm, title=title, base=first_frame(nominal))
 
 
-def _zero_offsets(record: Any) -> files.ZeroOffsets:
+def _zero_offsets(record: Any) -> Any:
     nominal = record.recording.nominal.arm
     readings = np.asarray(record.recording.capture.readings)[:, : nominal.joints]
     return files.zero_offsets(nominal, record.calibrated.arm, readings)
@@ -336,7 +336,7 @@ def correct(
     ),
     as_json: bool = options.JSON,
 ) -> None:
-    """Turn commanded poses into corrected joint readings, or into corrected poses.
+    """Correct commanded poses, as joint readings or poses.
 
     A controller that uses the nominal parameters expects the tip in the pose that the nominal arm has at the commanded
     joint readings. The corrected readings bring the tip of the calibrated arm to this pose. The nominal and the

@@ -33,7 +33,7 @@ def verify(
     tip: str | None = options.TIP_LINK,
     as_json: bool = options.JSON,
 ) -> None:
-    """Test the parameters with which an arm was delivered on a handful of poses.
+    """Test the maker's parameters on a few poses.
 
     The command prints the error of the tip as delivered, with U; whether the delivered parameters are better or worse
     than the nominal ones, or that these poses do not decide it; how many poses do; and what a recalibration would gain.

@@ -31,7 +31,15 @@ _MOUNT = (("d", "a"), ("a",), ("theta", "alpha", "beta"))  # the free parameters
 
 
 class ChainOf(NamedTuple):
-    """A chain of a robot as an arm of its own, and what is what: parameters, readings and base."""
+    """A chain of a robot as an arm of its own, and what is what: parameters, readings and base.
+
+    Example:
+        >>> arms = {"left": aj.load_arm("panda"), "right": aj.load_arm("panda")}
+        >>> robot = aj.kinematics.together(arms, bases={"right": (0.0, -800.0, 0.0)})
+        >>> chain = aj.kinematics.chain_of(robot, "right")
+        >>> print(chain.readings([0.0] * 7).shape, chain.names["a_3"], chain.names["probe_z"])
+        (1, 18) a_13 probe2_z
+    """
 
     arm: Arm
     base: Transform  # its base in that of the robot, mm

@@ -58,7 +58,7 @@ _LEAST_LEFT = 1e-6  # share of a row that the unknowns leave: what they explain 
 
 
 class Accuracy(NamedTuple):
-    """RMS error of the tip by one arm, mm, with its 95 % interval.
+    """RMS error of the tip by one arm, mm, with the interval at `coverage.LEVEL`.
 
     Example:
         >>> checked = aj.verify(aj.Recording(two_bars, nominal), nominal._replace(arm=true))
@@ -90,7 +90,7 @@ class Verification(NamedTuple):
     nominal: Accuracy
     delivered: Accuracy
     share: float  # of the correction from nominal to delivered that is real: 1 all, 0 nothing, 0.5 no better than none
-    share_lower: float  # 95 % interval
+    share_lower: float  # interval at `coverage.LEVEL`
     share_upper: float
     probability: float  # of such a share or a farther one from 0.5, where both arms are equally good
     poses: int
@@ -278,7 +278,7 @@ class _Paired(NamedTuple):
 
     share: float
     u: float
-    half_width: float  # of the 95 % interval
+    half_width: float  # of the interval at `coverage.LEVEL`
     probability: float
     same: bool
 

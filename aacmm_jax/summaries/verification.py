@@ -4,6 +4,7 @@ from typing import Any
 
 from ..core.text import pluralise
 from ..pipeline.verification import LEVEL, Accuracy, Verification
+from ..uncertainty.coverage import LEVEL_IN_PERCENT, U_AT_LEVEL
 from .tables import STYLES, Styled, View, listed, plain
 
 _VERDICTS = {"better": "good", "worse": "bad", "not decided": "unsure"}
@@ -58,7 +59,7 @@ def _accuracy(accuracy: Accuracy) -> dict[str, Any]:
 
 def _verdict(checked: Verification) -> str:
     nominal, delivered = checked.nominal, checked.delivered
-    of_delivered = f"{delivered.rms:.3g} mm RMS (95 %: {delivered.lower:.3g} to {delivered.upper:.3g} mm)"
+    of_delivered = f"{delivered.rms:.3g} mm RMS ({LEVEL_IN_PERCENT}: {delivered.lower:.3g} to {delivered.upper:.3g} mm)"
     if checked.same:
         return f"The delivered parameters are the nominal ones: {of_delivered} in these poses."
     against = (
@@ -113,13 +114,14 @@ def verification(summary: dict[str, Any]) -> View:
     columns: dict[str, Any] = {
         "parameters": "parameters",
         "RMS error [mm]": "rms_mm",
-        "U (95 %)": "expanded_mm",
+        U_AT_LEVEL: "expanded_mm",
         "errors of lengths [mm]": lengths,
     }
     yield listed(f"{summary['arm']}; delivered: {summary['delivered']}", summary["accuracy"], columns)
     share = summary["share"]
     yield (
-        f"Real share of the difference: {share['value']:.2f} (95 %: {share['lower']:.2f} to {share['upper']:.2f}). "
+        f"Real share of the difference: {share['value']:.2f} ({LEVEL_IN_PERCENT}: {share['lower']:.2f} to "
+        f"{share['upper']:.2f}). "
         f"{pluralise(summary['poses'], 'pose')}, {summary['equations']} equations, {summary['unknowns']} unknowns."
     )
     yield MEANING

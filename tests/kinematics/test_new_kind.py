@@ -35,7 +35,7 @@ class Bow(AbstractCorrection):
     shared: ClassVar[str | None] = ""
 
     def values(self, terms, q, forward):
-        return q[np.array([term.joint - 1 for term in terms])] ** 2
+        return q.joints[np.array([term.joint - 1 for term in terms])] ** 2
 
 
 @pytest.fixture(scope="module", autouse=True)
