@@ -30,7 +30,7 @@ def verify(
         "ARM",
     ),
     base: str | None = options.BASE_LINK,
-    tip: str | None = options.TIP_LINK,
+    tip: list[str] | None = options.TIP_LINK,
     as_json: bool = options.JSON,
 ) -> None:
     """Test the maker's parameters on a few poses.

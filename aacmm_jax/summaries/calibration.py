@@ -72,7 +72,7 @@ def arm_summary(specification: ArmSpecification) -> dict[str, Any]:
             for name, coefficient in kinds.items()
         ],
         "held": list(specification.space().held),
-        "urdf": None if urdf is None else {"format": urdf.format, "base": urdf.base, "tip": urdf.tip},
+        "urdf": None if urdf is None else {"format": urdf.format, "base": urdf.base, "tip": ", ".join(urdf.tips)},
     }
 
 
