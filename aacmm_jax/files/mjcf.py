@@ -5,7 +5,6 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from ..core.errors import InputError
 from ..core.text import quoted
@@ -154,6 +153,8 @@ def _changed(new: Transform, old: Transform) -> dict[str, str]:
 
 
 def _values(transform: Transform) -> dict[str, str]:
+    from scipy.spatial.transform import Rotation  # takes long to import
+
     quaternion = Rotation.from_matrix(transform[:3, :3]).as_quat(scalar_first=True, canonical=True)
     return {"pos": _row(transform[:3, 3] / 1000), "quat": _row(quaternion)}
 

@@ -13,9 +13,9 @@ from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from ..core.errors import InputError
+from ..core.rotations import rotation_matrix
 from ..core.text import quoted
 from ..core.units import DEG
 from ..kinematics.axes_to_dh import Transform, inverse
@@ -161,7 +161,7 @@ class _Reader:
                 if kind == "prismatic":
                     moved[:3, 3] = reference * axis
                 else:
-                    moved[:3, :3] = Rotation.from_rotvec(reference * axis).as_matrix()
+                    moved[:3, :3] = np.asarray(rotation_matrix(reference * axis))
             limits = self._limits(joint, unit)
             last = i == len(joints) - 1 and not anchor[:3, 3].any()
             child = name if last else unused_name(f"{name}, joint {i + 1}", self._links)
@@ -213,10 +213,10 @@ class _Reader:
         counts = {"quat": 4, "axisangle": 4, "xyaxes": 6, "zaxis": 3, "euler": 3}
         values = element.numbers(kind, (0.0,) * counts[kind])
         if kind == "euler":
-            turns = [Rotation.from_euler(axis, self._angle * x) for axis, x in zip(self._sequence, values, strict=True)]
             matrix = np.eye(3)
-            for axis, turn in zip(self._sequence, turns, strict=True):  # capital letters: about axes that stand still
-                matrix = matrix @ turn.as_matrix() if axis.islower() else turn.as_matrix() @ matrix
+            for axis, x in zip(self._sequence, values, strict=True):  # capital letters: about axes that stand still
+                turn = np.asarray(rotation_matrix(self._angle * x * np.eye(3)["xyz".index(axis.lower())]))
+                matrix = matrix @ turn if axis.islower() else turn @ matrix
             return matrix
         directions = {"axisangle": values[:3], "xyaxes": values[:3], "zaxis": values, "quat": values}[kind]
         size = float(np.linalg.norm(directions))
@@ -227,16 +227,17 @@ class _Reader:
                 f"{element.where} has {kind} = {quoted(element.attributes[kind])}, which is no direction; correct it."
             )
         if kind == "quat":
-            return Rotation.from_quat(values, scalar_first=True).as_matrix()
+            sine = float(np.linalg.norm(values[1:]))
+            return np.asarray(rotation_matrix(2 * math.atan2(sine, values[0]) * values[1:] / max(sine, 1e-300)))
         if kind == "axisangle":
-            return Rotation.from_rotvec(self._angle * values[3] * x).as_matrix()
+            return np.asarray(rotation_matrix(self._angle * values[3] * x))
         if kind == "xyaxes":
             y = y / np.linalg.norm(y)
             return np.stack([x, y, np.cross(x, y)], axis=1)
         normal = np.array([-x[1], x[0], 0.0])  # the least rotation from z; about x where it points down
         sine = float(np.linalg.norm(normal))
         normal = normal / sine if sine > 1e-10 else np.array([1.0, 0.0, 0.0])
-        return Rotation.from_rotvec(math.atan2(sine, x[2]) * normal).as_matrix()
+        return np.asarray(rotation_matrix(math.atan2(sine, x[2]) * normal))
 
     def _new_link(self, element: Element) -> str:
         """The name of the link of a body or site."""
