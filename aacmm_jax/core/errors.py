@@ -12,6 +12,7 @@ _COMPARED = 200  # characters of a word: comparing takes their square
 _PACKAGES = {
     "plot": "matplotlib", "report": "jinja2", "data": "xarray", "dask": "distributed", "camera": "cv2",
     "excel": "openpyxl", "ros": "rosbags", "lerobot": "pyarrow",
+    "live": "starlette",
 }  # fmt: skip
 
 

@@ -277,9 +277,8 @@ def _action(body: bytes) -> tuple[str, dict[str, Any]]:
         given = json.loads(body)
     except (ValueError, RecursionError):
         raise InputError("an action must be JSON") from None
-    name = given.get("action") if isinstance(given, dict) else None
-    wanted = _ACTIONS.get(name) if isinstance(name, str) else None
-    if wanted is None:
+    name = str(given.get("action")) if isinstance(given, dict) else ""
+    if (wanted := _ACTIONS.get(name)) is None:
         raise InputError(f"an action must be one of {', '.join(_ACTIONS)}")
     fields = {key: value for key, value in given.items() if key != "action"}
     if fields.keys() != wanted.keys():

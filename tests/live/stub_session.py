@@ -26,7 +26,7 @@ class StubSession:
             for i in range(places)
         ]  # fmt: skip
         self.poses: list[dict[str, Any]] = []
-        self.auto_on, self.celsius, self.session, self.done = True, 20.0, 1, False
+        self.auto_on, self.celsius, self.session, self.done, self.here = True, 20.0, 1, False, None
         for _ in range(poses):
             self.take()
         self.asked.clear()
@@ -81,7 +81,7 @@ class StubSession:
         self.auto_on = on
 
     def _place(self, name: str) -> None:
-        self.places.sort(key=lambda place: place["name"] != name)
+        self.here = name
 
     def _finish(self, calibrate: bool) -> None:
         self.done = True
@@ -90,21 +90,21 @@ class StubSession:
         with self.lock:
             q, t = self.now(), time.monotonic() - self.began
             links = self.links(q)
-            device = {"name": "simulated:panda", "connected": True, "lines": int(100 * t), "bad": 3, "rate": 99.7}
+            device = {"name": "simulated:panda", "connected": True, "lines": int(100 * t), "bad": {"wrong checksum": 3}}
             live = {
-                "q": list(q), "links": links, "tip": links[-1], "still": t % 4 > 2, "since": max(t % 4 - 2, 0),
-                "rate": 100.0, "devices": [device | {"message": self.text}],
+                "q": list(np.rad2deg(q)), "links": links, "tip": links[-1],
+                "still": t % 4 > 2, "since": max(t % 4 - 2, 0), "rate": 100.0, "place": self.here, "devices": [device | {"message": self.text}],
             }  # fmt: skip
             sound = len(self.poses)
             if since == self.version:
                 return {"version": self.version, "live": live, "sound": sound}
             n, target = max(len(self.poses), 1), self.places[sound % len(self.places)]
             words = ["The arm was calibrated; U of a length is 0.12 mm.", self.text] if self.done else []
-            paths = {"capture": "capture.h5", "report": "capture-report.html"} if self.done else {}
-            joints = [{"name": f"joint {i + 1}", "kind": "revolute"} for i in range(len(q))]
+            paths = ["capture.h5", "capture-report.html"] if self.done else []
+            joints = [{"name": f"joint {i + 1}", "kind": "revolute", "unit": "deg"} for i in range(len(q))]
             return {
                 "version": self.version, "live": live, "sound": sound, "auto": self.auto_on, "session": self.session,
-                "temperature": self.celsius, "busy": None, "place": self.places[0]["name"], "stop": False,
+                "temperature": self.celsius, "busy": None, "message": "", "stop": False,
                 "headline": f"Put the tip into {target['name']}", "arm": {"name": "panda", "joints": joints},
                 "places": self.places, "poses": self.poses, "sentences": words, "paths": paths,
                 "next": {"place": target["name"], "q": list(q), "links": self.links(self.home - 0.4), "distance": 0.4,

@@ -11,6 +11,7 @@ from .stub_session import StubSession
 
 WIDTHS = [(400, "dark"), pytest.param(1600, "light", marks=pytest.mark.slow)]
 ROWS = "count => document.querySelectorAll('#poses tr').length === count"
+FRAMES = "least => Number(document.getElementById('view').dataset.frames) > least"
 MARKUP = "<img src=x onerror=document.title='caught'>\x1b[2J\u202e" + "very long " * 300
 
 

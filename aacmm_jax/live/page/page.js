@@ -4,7 +4,7 @@ import { View } from "./view.js";
 const $ = (id) => document.getElementById(id);
 const view = new View($("view"));
 const token = location.hash.slice(1);
-let state = null, chosen = null, sounds = null, loud = true, audio = null;
+let state = null, here = null, chosen = null, sounds = null, loud = true, audio = null;
 
 const digits = (value, count = 3) => Number(value.toPrecision(count)).toString();
 const known = (value) => typeof value === "number";
@@ -28,8 +28,8 @@ function element(name, text, className) {
 async function ask(action, fields = {}) {
   put($("message"), "");
   try {
-    const answer = await fetch("do", { method: "POST", headers: { "Content-Type": "application/json", "X-Token": token },
-      body: JSON.stringify({ action, ...fields }) });
+    const headers = { "Content-Type": "application/json", "X-Token": token };
+    const answer = await fetch("do", { method: "POST", headers, body: JSON.stringify({ action, ...fields }) });
     if (!answer.ok) put($("message"), (await answer.json()).message);
   } catch {
     put($("message"), "The session does not answer; nothing was done.");
@@ -45,7 +45,11 @@ function choose(question, choices, answer) {
   box.replaceChildren(...[...choices, ["Cancel", null]].map(([text, act], i) => {
     const button = element("button", text);
     button.type = i ? "button" : "submit"; // Enter in the text field does the first
-    button.addEventListener("click", (event) => { event.preventDefault(); dialog.close(); act?.($("answer").value.trim()); });
+    button.addEventListener("click", (event) => {
+      event.preventDefault();
+      dialog.close();
+      act?.($("answer").value.trim());
+    });
     return button;
   }));
   dialog.showModal();
@@ -136,10 +140,15 @@ function live(now) {
   if (!now) return;
   put($("stillness"), now.still ? `Still ${known(now.since) ? now.since.toFixed(1) : ""} s` : "Moving");
   $("now").classList.toggle("still", Boolean(now.still));
-  const values = (now.q ?? []).map((value, i) => joint(state?.arm.joints[i], value));
-  [...$("joints").querySelectorAll("dd")].forEach((node, i) => put(node, values[i] ?? "–"));
+  [...$("joints").querySelectorAll("dd")].forEach((node, i) => {
+    const unit = { deg: "°" }[state?.arm.joints[i]?.unit] ?? ` ${state?.arm.joints[i]?.unit ?? ""}`;
+    put(node, known(now.q?.[i]) ? `${now.q[i].toFixed(3)}${unit}` : "–");
+  });
   view.show({ links: now.links ?? [], tip: now.tip ?? null });
-  put($("tip"), now.tip ? `Tip: ${now.tip.map((value) => (known(value) ? value.toFixed(2) : "–")).join(", ")} mm` : "");
+  put($("rate"), known(now.rate) ? `${digits(now.rate, 2)} readings a second` : "");
+  if (now.place !== here) { here = now.place; if (state) places(); }
+  const tip = now.tip?.map((value) => (known(value) ? value.toFixed(2) : "–"));
+  put($("tip"), tip ? `Tip: ${tip.join(", ")} mm` : "");
   put($("legend"), [state?.next && "Dashed: next pose", state?.poses.some((pose) => pose.residual)
     && `thin lines: residuals, enlarged ${view.enlarged} times`].filter(Boolean).join("; "));
   const list = $("devices");
@@ -147,23 +156,22 @@ function live(now) {
   (now.devices ?? []).forEach((device, i) => {
     const line = list.children[i] ?? list.appendChild(element("li"));
     if (!line.children.length) line.append(element("span"), " ", element("span", "", "text"));
-    const bad = device.bad ? `, ${device.bad} bad` : "";
-    const rate = known(device.rate) ? `, ${digits(device.rate, 2)} a second` : "";
-    put(line.children[0], `${device.name}: ${device.connected ? "connected" : "not connected"}, ${device.lines} lines${bad}${rate}`);
+    const bad = Object.entries(device.bad ?? {}).map(([reason, count]) => `, ${count} bad (${reason})`).join("");
+    const there = device.connected ? "connected" : "not connected";
+    put(line.children[0], `${device.name}: ${there}, ${device.lines} lines${bad}`);
     line.children[0].className = device.connected ? "" : "off";
     put(line.children[1], device.message);
   });
 }
 
-const joint = (about, value) => (!known(value) ? "–" : about?.kind === "prismatic" ? `${value.toFixed(3)} mm`
-  : `${(value * 180 / Math.PI).toFixed(3)}°`);
-
 function poses() {
   const rows = [...state.poses].reverse().map((pose) => {
     const row = element("tr", undefined, pose.excluded ? "excluded" : pose.outlier ? "outlier" : "");
-    const notes = [pose.outlier && "outlier", pose.excluded && "excluded", pose.session > 1 && `session ${pose.session}`];
-    row.append(element("td", pose.number, "number"), element("td", pose.place), element("td", length(pose.residual_mm), "number"),
-      element("td", length(pose.expected_mm), "number"), element("td", notes.filter(Boolean).join(", ")));
+    const notes = [pose.outlier && "outlier", pose.excluded && "excluded",
+      pose.session > 1 && `session ${pose.session}`];
+    row.append(element("td", pose.number, "number"), element("td", pose.place),
+      element("td", length(pose.residual_mm), "number"), element("td", length(pose.expected_mm), "number"),
+      element("td", notes.filter(Boolean).join(", ")));
     row.setAttribute("aria-selected", pose.number === chosen);
     row.addEventListener("click", () => { chosen = chosen === pose.number ? null : pose.number; poses(); });
     return row;
@@ -178,10 +186,11 @@ function places() {
   $("places").replaceChildren(...state.places.map((place) => {
     const item = element("li"), button = element("button"), wanted = place.wanted || 0;
     button.type = "button";
-    button.classList.toggle("here", place.name === state.place);
-    button.classList.toggle("next", place.name === state.next?.place && place.name !== state.place);
-    if (place.name === state.place) button.setAttribute("aria-current", "true");
-    button.append(element("span", place.name), element("span", wanted ? `${place.poses} of ${wanted}` : `${place.poses}`));
+    button.classList.toggle("here", place.name === here);
+    button.classList.toggle("next", place.name === state.next?.place && place.name !== here);
+    if (place.name === here) button.setAttribute("aria-current", "true");
+    button.append(element("span", place.name));
+    button.append(element("span", wanted ? `${place.poses} of ${wanted}` : `${place.poses}`));
     if (wanted) {
       const bar = element("progress", undefined, place.poses >= wanted ? "done" : "");
       [bar.max, bar.value] = [wanted, Math.min(place.poses, wanted)];
@@ -199,7 +208,7 @@ function everything() {
   document.title = `${arm.name} – live capture`;
   put($("arm"), arm.name);
   put($("headline"), state.busy || state.headline);
-  put($("why"), next?.why);
+  put($("why"), state.message || next?.why);
   put($("u-now"), length(progress.u_length_mm));
   put($("u-after"), length(progress.u_after_ten_mm));
   put($("u-target"), length(progress.u_target_mm));
@@ -218,9 +227,9 @@ function everything() {
   places();
   poses();
   for (const id of ["sentences", "paths"]) {
-    $(id).replaceChildren(...Object.values(state[id] ?? []).map((text) => element("li", text)));
+    $(id).replaceChildren(...(state[id] ?? []).map((text) => element("li", text)));
   }
-  $("results").hidden = !state.sentences?.length && !Object.keys(state.paths ?? {}).length;
+  $("results").hidden = !state.sentences?.length && !state.paths?.length;
   view.show({ places: state.places, poses: state.poses, next: next?.place ?? null,
     ghost: next?.links?.length ? { links: next.links } : null });
 }
@@ -271,7 +280,12 @@ async function listen(signal) {
 for (let wait = 500; ; wait = Math.min(3000, wait * 1.5)) {
   let reason = "";
   const ending = new AbortController();
-  try { await listen(ending.signal); wait = 500; } catch (error) { reason = error instanceof TypeError ? "" : error.message; }
+  try {
+    await listen(ending.signal);
+    wait = 500;
+  } catch (error) {
+    reason = error instanceof TypeError ? "" : error.message; // TypeError: nobody listens there
+  }
   ending.abort();
   connected(reason || "No connection to the session; trying again");
   await new Promise((resolve) => setTimeout(resolve, wait));

@@ -78,7 +78,8 @@ export class View {
   // A box about all that was ever shown: it grows, so that the picture does not jump.
   #enclose() {
     const { places, poses, links, ghost } = this.scene;
-    const all = [...links, ...(ghost?.links ?? []), ...places.map((place) => place.position), ...poses.map((p) => p.tip)];
+    const known = [...places.map((place) => place.position), ...poses.map((pose) => pose.tip)];
+    const all = [...links, ...(ghost?.links ?? []), ...known];
     for (const point of all) {
       if (!usable(point)) continue;
       for (let i = 0; i < 3; i++) {
@@ -95,8 +96,8 @@ export class View {
     const c = Math.cos(this.turn), s = Math.sin(this.turn), ct = Math.cos(this.tilt), st = Math.sin(this.tilt);
     const across = c * x - s * y, away = s * x + c * y;
     const depth = ct * away - st * z, near = 1 / (1 + 0.22 * depth);
-    return [this.width / 2 + this.scale * across * near, this.height / 2 - this.scale * (ct * z + st * away) * near, depth,
-      near];
+    const size = this.scale * near;
+    return [this.width / 2 + size * across, this.height / 2 - size * (ct * z + st * away), depth, near];
   }
 
   #paint() {
@@ -109,16 +110,17 @@ export class View {
     pen.clearRect(0, 0, this.width, this.height);
     if (!this.colours) {
       const style = getComputedStyle(document.documentElement);
-      this.colours = Object.fromEntries(["ink", "soft", "line", "faint", "page", "arm", "arm-light", "ghost", "floor", "good",
-        "bad", "warm"].map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
+      const names = ["ink", "soft", "line", "page", "arm", "arm-light", "ghost", "floor", "good", "bad", "warm"];
+      this.colours = Object.fromEntries(names.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
     }
     this.#enclose();
-    this.scale = 0.95 * this.zoom * Math.min(this.width, this.height) / 2;
+    this.scale = 1.15 * this.zoom * Math.min(this.width, this.height) / 2;
     this.strokes = [];
     this.enlarged = this.#enlarged();
     this.#floor();
     this.#marks();
-    const { links, ghost, tip } = this.scene, thick = clamp(Math.min(this.width, this.height) * 0.03, 7, 22) * this.zoom ** 0.5;
+    const { links, ghost, tip } = this.scene, short = Math.min(this.width, this.height);
+    const thick = clamp(short * 0.03, 7, 22) * this.zoom ** 0.5;
     if (ghost) {
       this.#chain(ghost.links, thick, true);
       if (tip) this.#line([tip, ghost.links.at(-1)], this.colours.ghost, 2, [3, 6]);
@@ -156,8 +158,8 @@ export class View {
   #floor() {
     const z = Math.min(this.low[2], 0), size = 10 ** Math.floor(Math.log10(this.extent));
     const step = [0.1, 0.2, 0.5, 1].map((part) => part * size).find((s) => this.extent / s < 7) ?? size;
-    const [from, to] = [0, 1].map((i) => [Math.floor(this.low[i] / step - 0.5) * step, Math.ceil(this.high[i] / step + 0.5) * step])
-      .reduce((a, b) => [[a[0], b[0]], [a[1], b[1]]]);
+    const from = this.low.map((low) => Math.floor(low / step - 0.5) * step);
+    const to = this.high.map((high) => Math.ceil(high / step + 0.5) * step);
     const put = (a, b) => this.#stroke([this.#project(a), this.#project(b)], this.colours.line, 1);
     for (let x = from[0]; x <= to[0] + step / 2; x += step) put([x, from[1], z], [x, to[1], z]);
     for (let y = from[1]; y <= to[1] + step / 2; y += step) put([from[0], y, z], [to[0], y, z]);
@@ -173,13 +175,15 @@ export class View {
         if (ghost) { this.#stroke([a, b], this.colours.ghost, 3, [7, 7]); return; }
         this.#stroke([a, b], this.colours.page, width + 3);
         this.#stroke([a, b], this.colours.arm, width);
-        this.#stroke([a, b].map(([x, y]) => [x - width * 0.14, y - width * 0.18]), this.colours["arm-light"], width * 0.28);
+        const lit = [a, b].map(([x, y]) => [x - width * 0.14, y - width * 0.18]);
+        this.#stroke(lit, this.colours["arm-light"], width * 0.28);
       } });
     }
     seen.forEach((at, i) => this.strokes.push({ depth: at[2] - 0.02, paint: () => {
       const radius = (i === last ? 0.3 : 0.62 - 0.3 * i / last) * thick * at[3];
-      if (ghost) this.#dot(at, i === last ? 6 : 4, i === last ? this.colours.ghost : this.colours.page, this.colours.ghost);
-      else this.#dot(at, radius, i === last ? this.colours.warm : this.colours.page, this.colours.arm, 2.5);
+      const { page, arm, warm, ghost: dashed } = this.colours;
+      if (ghost) this.#dot(at, i === last ? 6 : 4, i === last ? dashed : page, dashed);
+      else this.#dot(at, radius, i === last ? warm : page, arm, 2.5);
     } }));
   }
 
@@ -193,8 +197,8 @@ export class View {
       this.strokes.push({ depth: at[2], paint: () => {
         const done = place.wanted && place.poses >= place.wanted, next = place.name === this.scene.next;
         this.#dot(at, 7, done ? colours.good : colours.page, next ? colours.ghost : colours.ink, next ? 4 : 2);
-        Object.assign(pen, { font: "600 14px system-ui, 'DejaVu Sans', sans-serif", lineWidth: 4, strokeStyle: colours.page,
-          fillStyle: next ? colours.ghost : colours.ink });
+        Object.assign(pen, { font: "600 14px system-ui, 'DejaVu Sans', sans-serif", lineWidth: 4,
+          strokeStyle: colours.page, fillStyle: next ? colours.ghost : colours.ink });
         const name = place.name.length > 24 ? `${place.name.slice(0, 23)}…` : place.name;
         pen.strokeText(name, at[0] + 12, at[1] - 9);
         pen.fillText(name, at[0] + 12, at[1] - 9);
@@ -214,8 +218,9 @@ export class View {
 
   // How much residuals are enlarged, so that the 90 % longest is about a twelfth of the picture.
   #enlarged() {
-    const sizes = this.scene.poses.filter((pose) => usable(pose.residual) && !pose.outlier);
-    const large = sizes.map((pose) => Math.hypot(...pose.residual)).sort((a, b) => a - b)[Math.floor(0.9 * (sizes.length - 1))];
+    const drawn = this.scene.poses.filter((pose) => usable(pose.residual) && !pose.outlier);
+    const lengths = drawn.map((pose) => Math.hypot(...pose.residual)).sort((a, b) => a - b);
+    const large = lengths[Math.floor(0.9 * (lengths.length - 1))];
     if (!large) return 1;
     const wanted = this.extent / 6 / large, power = 10 ** Math.floor(Math.log10(wanted));
     return Math.max(1, [5, 2, 1].find((digit) => digit * power <= wanted) * power);
