@@ -94,6 +94,16 @@ def serving(session: LiveSession, *, host: str = "127.0.0.1", port: int = 0, tok
 
     Raises:
         InputError: The extra ``live`` is missing, the token is too short or missing, or the address is in use.
+
+    Example:
+        >>> arm, noise = (load("panda") for load in (aj.files.load_specification, aj.files.load_noise))
+        >>> setup = aj.live.setup_of(arm, noise, [aj.data.observations.SimulatedSocket("A", (400, 0, 300), 5)])
+        >>> with (
+        ...     aj.live.Session(setup, ["simulated:?seed=1"], path="served.h5") as session,
+        ...     aj.live.serving(session, token="a-token-of-my-own") as address,
+        ... ):
+        ...     print(address.partition("#")[2])
+        a-token-of-my-own
     """
     require("live", "The page of a live session")
     import uvicorn

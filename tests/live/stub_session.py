@@ -93,7 +93,8 @@ class StubSession:
             device = {"name": "simulated:panda", "connected": True, "lines": int(100 * t), "bad": {"wrong checksum": 3}}
             live = {
                 "q": list(np.rad2deg(q)), "links": links, "tip": links[-1],
-                "still": t % 4 > 2, "since": max(t % 4 - 2, 0), "rate": 100.0, "place": self.here, "devices": [device | {"message": self.text}],
+                "still": t % 4 > 2, "since": max(t % 4 - 2, 0), "rate": 100.0,
+                "place": self.here, "devices": [device | {"message": self.text}],
             }  # fmt: skip
             sound = len(self.poses)
             if since == self.version:
