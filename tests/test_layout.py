@@ -21,6 +21,7 @@ STUBS = sorted(PACKAGE.rglob("__init__.pyi"))
 # From the top: a folder imports from those below it only.
 LAYERS = (
     {"cli"},
+    {"live"},
     {"report"},
     {"plot", "certificate"},
     {"study"},
