@@ -1,4 +1,4 @@
-"""YAML as cameras' and controllers' files have it: nested keys, lists and texts. PyYAML parses it; numbers stay text."""
+"""YAML as cameras' and controllers' files have it: nested keys, lists and texts, parsed by PyYAML; numbers stay text."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -6,7 +6,7 @@ from ..core.errors import InputError
 from ..core.text import quoted
 
 if TYPE_CHECKING:
-    from yaml import Node
+    from yaml.nodes import Node
 
 _DEEPEST = 20  # levels of nesting; PyYAML calls itself for each
 
@@ -40,13 +40,13 @@ def yaml_content(text: str) -> dict[str, Any]:
 
 
 def _content(node: "Node") -> Any:
-    if node.id == "scalar":
-        return node.value
-    if node.id == "sequence":
-        return [_content(item) for item in node.value]
+    import yaml
+
+    if not isinstance(node, yaml.MappingNode):
+        return [_content(item) for item in node.value] if isinstance(node, yaml.SequenceNode) else node.value
     entries: dict[str, Any] = {}
     for key, value in node.value:
-        if key.id != "scalar":
+        if not isinstance(key, yaml.ScalarNode):
             raise InputError(f"{_line(key)} has a list or table as key; correct the line.")
         if key.value in entries:
             raise InputError(f"{_line(key)}: {quoted(key.value)} occurs twice; remove one of the two.")
