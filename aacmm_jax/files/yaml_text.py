@@ -1,4 +1,4 @@
-"""YAML as cameras' and controllers' files have it: nested keys, lists and texts, parsed by PyYAML; numbers stay text."""
+"""YAML as cameras' and controllers' files have it: nested keys, lists and texts, from PyYAML; numbers stay text."""
 
 from typing import TYPE_CHECKING, Any
 
