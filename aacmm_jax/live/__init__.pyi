@@ -7,3 +7,4 @@ from .places import capture_of as capture_of
 from .places import setup_of as setup_of
 from .samples import Sample as Sample
 from .session import Session as Session
+from .setups import read_setup as read_setup
