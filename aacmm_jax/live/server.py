@@ -133,7 +133,8 @@ def serving(session: LiveSession, *, host: str = "127.0.0.1", port: int = 0, tok
     while not server.started and thread.is_alive():
         time.sleep(0.01)
     try:
-        yield f"http://{name}:{port}/#{secret}"
+        local = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}.get(name, name)
+        yield f"http://{local}:{port}/#{secret}"
     finally:
         server.should_exit = True
         thread.join(5.0)

@@ -44,6 +44,7 @@ class Session:
         path: Where `finish` writes the capture; its journal is beside it, and is continued if it exists.
         target: Expanded uncertainty (95 %) of a length that is enough, mm; None for none.
         automatic: Whether a pose is taken by itself at every rest in a place.
+        stream: File to which everything that devices send is appended; by default it is not kept.
 
     Raises:
         InputError: A device or the journal cannot be used, or the journal is of another capture.
@@ -70,10 +71,12 @@ class Session:
         path: str | os.PathLike = "capture.h5",
         target: float | None = None,
         automatic: bool = True,
+        stream: str | os.PathLike | None = None,
     ):
         self.setup, self.path, self.target = setup, Path(path), target
         self._arm: Arm = to_numpy(setup.specification.arm)
         self._lock, self._wake, self._stop = threading.RLock(), threading.Event(), threading.Event()
+        self._stream = None if stream is None else open(stream, "ab")  # noqa: SIM115 - closed by `close`
         self._captured = Captured(setup)
         self._auto, self._forced = automatic, None
         self._version = self._sound = 0
@@ -185,6 +188,9 @@ class Session:
         for device in self._devices:
             device.close()
         self._devices = []
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
         if not self._closed:
             self._closed = True
             self._journal.close()
@@ -285,6 +291,8 @@ class Session:
             any_came = False
             for device in self._devices:
                 samples = device.read()
+                if self._stream is not None and (raw := device.raw()):
+                    self._stream.write(raw)
                 any_came = any_came or bool(samples)
                 if samples:
                     with self._lock, contextlib.suppress(InputError):
