@@ -63,10 +63,7 @@ def live(
 
             written = show(session, calibrate=not capture_only)
         else:
-            from ..live.server import serve
-
-            host = "127.0.0.1" if token is None else "0.0.0.0"
-            serve(session, port=port, token=token, host=host, ready=lambda url: _ready(url, not no_browser))
+            _serve(session, port, token, not no_browser)
             written = session.state()["paths"]
         poses = len(session.state()["poses"])
     if written:
@@ -75,11 +72,22 @@ def live(
         typer.echo(f"{poses} poses are kept in {output}.journal; run the same command to go on.")
 
 
-def _ready(url: str, browser: bool) -> None:
+def _serve(session: Any, port: int, token: str | None, browser: bool) -> None:
+    """Show the page until the command is interrupted."""
+    import contextlib
+    import socket
+    import threading
+
     import typer
 
-    typer.echo(f"The page is at {url} (Ctrl-C ends).")
-    if browser:
-        import webbrowser
+    from ..live.server import opened, serving
 
-        webbrowser.open(url)
+    host = "127.0.0.1" if token is None else "0.0.0.0"
+    with serving(session, host=host, port=port, token=token) as address, contextlib.ExitStack() as stack:
+        typer.echo(f"The page is at {address} (Ctrl-C ends).")
+        if token is not None:
+            typer.echo(f"From other computers: {address.replace('127.0.0.1', socket.gethostname(), 1)}")
+        if browser and not stack.enter_context(opened(address)):
+            typer.echo("No browser was found here; open the address in one.")
+        with contextlib.suppress(KeyboardInterrupt):
+            threading.Event().wait()

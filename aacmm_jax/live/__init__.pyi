@@ -8,5 +8,6 @@ from .places import TakenPose as TakenPose
 from .places import capture_of as capture_of
 from .places import setup_of as setup_of
 from .samples import Sample as Sample
+from .server import serving as serving
 from .session import Session as Session
 from .setups import read_setup as read_setup
