@@ -28,6 +28,7 @@ from ..planning.kit_placement import KitItem
 
 COLUMNS = {"torques": "torque_{}", "directions": "direction_{}", "load": "load_kg", "thermometer": "temperature_C"}
 _NEUTRAL = {"thermometer": 20.0}
+_FREE = ("points", "transforms", "pixels", "distances")
 _WANTED = 8  # poses in each place of which a plan says nothing
 
 
@@ -54,6 +55,11 @@ class Place(NamedTuple):
     def kind(self) -> str:
         """``socket``, ``artefact``, ``points`` and so on: the name of its tables in a kit."""
         return self.thing.table
+
+    @property
+    def is_free(self) -> bool:
+        """Whether the tip may be anywhere: an instrument sees it."""
+        return self.kind in _FREE
 
 
 class TakenPose(NamedTuple):

@@ -44,7 +44,6 @@ _OPTIONS = {
 }
 _FASTEST = 1.2  # rad/s, or m/s of prismatic joints
 _AHEAD = 0.5  # s that are computed at once
-_ASLEEP = 60.0
 
 
 def open_device(where: str, options: Mapping[str, str], setup: Setup) -> "Simulated":
@@ -80,7 +79,9 @@ class Simulated(AbstractDevice):
         self._place: Place | None = None
         self._seated = False
         self._ready: list[Sample] = []
-        self._clock, self._start = 0.0, time.monotonic()  # simulated time up to which samples were computed
+        self._clock = self._now = 0.0  # simulated time up to which samples were computed, and were given
+        self._read_at = time.monotonic()
+        self._kept = np.eye(self.joints)  # motions that the seat allows
         self._goals: deque[tuple[Place | None, np.ndarray]] = deque(maxlen=1)  # set by another thread
 
     def _true_positions(self) -> dict[str, Float[np.ndarray, " 3"]]:
@@ -100,12 +101,13 @@ class Simulated(AbstractDevice):
             self._goals.append((place, np.asarray(q, dtype=float)))
 
     def read(self) -> list[Sample]:
-        now = (time.monotonic() - self._start) * self.options["speed"]
-        if now < self._clock + 1 / RATE and not self._ready:
+        elapsed = time.monotonic() - self._read_at
+        if elapsed * self.options["speed"] < 1 / RATE:
             time.sleep(0.002)
             return []
-        if now - self._clock > _ASLEEP:  # a computer that was asleep does not catch up
-            self._clock = now - _AHEAD
+        self._read_at += elapsed
+        # Time runs slower where the computer cannot keep up, and stands still while it sleeps.
+        now = self._now = self._now + min(elapsed * self.options["speed"], _AHEAD)
         while self._clock < now:
             self._compute(now)
         count = next((i for i, sample in enumerate(self._ready) if sample.time > now), len(self._ready))
@@ -122,6 +124,10 @@ class Simulated(AbstractDevice):
             return
         wanted, self._seated = self._there(q)
         self._move(wanted)
+        self._kept = np.eye(self.joints)
+        if self._seated:  # the seat holds the tip: what would move it is left out
+            jacobian = np.asarray(self.true.jacobian(self._columns(wanted), self._readings))
+            self._kept -= np.linalg.pinv(jacobian) @ jacobian
         self._hold(self.options["hold"])
 
     def _there(self, q: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -167,9 +173,7 @@ class Simulated(AbstractDevice):
             tremor[i] = self._tremor
         moves = self.options["tremor"] * self.encoder * tremor
         moves += np.outer(np.arange(count) / RATE, np.full(self.joints, self.options["creep"]))
-        if self._seated:  # the seat holds the tip: what would move it is left out
-            jacobian = np.asarray(self.true.jacobian(self._columns(self._q), self._readings))
-            moves = moves - moves @ (np.linalg.pinv(jacobian) @ jacobian).T
+        moves = moves @ self._kept
         measured = {} if self._place is None or self._place.position is not None else self._measured(self._place)
         self._emit(self._q + moves * bool(not measured), measured)
 
