@@ -20,12 +20,13 @@ from ..model.observed import Observed
 from ..planning.designs import Candidates, covariance_of, exchange
 from ..planning.kit import neighbours
 from ..planning.kit_placement import Thing, candidates_of_kit, set_up
+from ..planning.placement import LEAST_POSES
 from ..planning.problem import DesignProblem, PlanOptions
 from .places import Setup, by_thing, label_of
 
 TEN = 10  # poses that a prediction is for
 _STARTS = 2000  # random configurations in all things
-_FIRST, _MOST, _ADDED = 30, 60, 5  # poses of a plan where nothing is stated; the most ahead; added to them at once
+_FIRST, _MOST, _ADDED = 30, 60, 3  # poses of a plan where nothing is stated; the most ahead; added to them at once
 _SEARCHED = 400  # candidates that an exchange tries, drawn anew after every pose
 
 Observations = Sequence[AbstractObservation]
@@ -80,21 +81,30 @@ class Search:
             raise InputError(next(iter(self.unreached.values())))
         self._names = {place.name: i for i, place in enumerate(setup.places)}
         self._pools: dict[tuple[str, str], Pool] = {}
-        stated = self._stated(drawn)
-        first = [drawn] if stated is None else [stated, drawn]
-        if stated is None:
+        every = np.full(len(setup.places), LEAST_POSES)
+        stated, self.planned = self._stated(drawn)
+        first = [stated, drawn] if self.planned else [drawn]
+        if not self.planned:
             pool = self._pool(first, "", "")
-            self.planned = self.chosen(pool.candidates, min(_FIRST, len(pool.q)), sweeps=3)
-        else:
-            self.planned = list(range(sum(len(part.q) for part in stated)))
+            self.planned = self.chosen(pool.candidates, min(_FIRST, len(pool.q)), least=every, sweeps=3)
         # Poses near to chosen ones are often far better than random ones.
         self._sets = [*first, self._near(first[0])]
-        if stated is None:
-            self.planned = self.chosen(self.pool().candidates, len(self.planned), self.planned, sweeps=2)
+        if len(first) == 1:
+            self.planned = self.chosen(self.pool().candidates, len(self.planned), self.planned, every, sweeps=2)
 
-    def chosen(self, candidates: Candidates, count: int, start: Sequence[int] = (), sweeps: int = 0) -> list[int]:
-        """The best candidates, beginning with some."""
-        return exchange(candidates, count, self.problem.objective, least=0, sweeps=sweeps, start=start).tolist()
+    def chosen(
+        self,
+        candidates: Candidates,
+        count: int,
+        start: Sequence[int] = (),
+        least: int | Int[np.ndarray, " s"] = 0,
+        sweeps: int = 0,
+    ) -> list[int]:
+        """The best candidates, beginning with some, and at least so many in each place."""
+        if not isinstance(least, int):  # nothing is asked of a place without candidates
+            there = np.bincount(candidates.owner)
+            least = np.minimum(least[: len(there)], there)
+        return exchange(candidates, count, self.problem.objective, least=least, sweeps=sweeps, start=start).tolist()
 
     def pool(self, session: str = "", probe: str = "") -> Pool:
         """The candidates in a session of several: its name, and that of its probe as in `join_sessions`."""
@@ -111,22 +121,29 @@ class Search:
         """Of the lengths over the volume, mm^2."""
         return np.sum(self.problem.lengths @ covariance * self.problem.lengths, axis=1)
 
-    def ahead(self, known: Candidates, ahead: Sequence[int], target: float | None) -> list[int]:
-        """What is left to be taken, planned again: as many poses as reach the target (a standard uncertainty, mm), or
-        as many as before."""
+    def ahead(
+        self, known: Candidates, ahead: Sequence[int], least: Int[np.ndarray, " s"], target: float | None
+    ) -> list[int]:
+        """What is left to be taken, planned again: as many poses as before, or some more or less where these do not
+        reach the target (a standard uncertainty, mm) or fewer do; at least so many in each place."""
         random, count = self.problem.region.random, len(known.rows)
         tried = np.unique([*ahead, *random.choice(count, min(_SEARCHED, count), replace=False)]).astype(int)
         part = known._replace(rows=known.rows[tried], owner=known.owner[tried])
         chosen = np.searchsorted(tried, ahead).tolist()
-        chosen = self.chosen(part, max(len(chosen), 1), chosen, sweeps=1)
+        chosen = self.chosen(part, max(len(chosen), 1), chosen, least, sweeps=1)
 
-        def reached(rows: Sequence[int]) -> bool:
-            return target is not None and self.u(part.information(part.rows[rows])) <= target
+        def u(rows: Sequence[int]) -> float:
+            return self.u(part.information(part.rows[list(rows)]))
 
-        while target is not None and len(chosen) < _MOST and not reached(chosen):
-            chosen = self.chosen(part, len(chosen) + _ADDED, chosen)
-        while len(chosen) > 1 and reached(chosen[:-1]):
-            chosen = chosen[:-1]
+        if target is not None and u(chosen) > target and len(chosen) < _MOST:
+            chosen = self.chosen(part, len(chosen) + _ADDED, chosen, least, sweeps=1)
+        while target is not None and len(chosen) > 1 and u(chosen) <= target:  # without that which is worth least
+            spare = np.bincount(part.owner[chosen], minlength=len(least)) > least
+            fewer = [[*chosen[:i], *chosen[i + 1 :]] for i in range(len(chosen)) if spare[part.owner[chosen[i]]]]
+            best = min(fewer, key=u, default=chosen)
+            if best is chosen or u(best) > target:
+                break
+            chosen = best
         return tried[chosen].tolist()
 
     def ten(self, known: Candidates, ahead: Sequence[int]) -> Float[np.ndarray, "P P"]:
@@ -157,17 +174,17 @@ class Search:
         candidates = parts[0]._replace(rows=np.concatenate(rows), owner=np.array(places))
         return Pool(np.concatenate(q), np.array(places), candidates, columns)
 
-    def _stated(self, drawn: Observations) -> list[AbstractObservation] | None:
-        """The poses that were planned, in each thing; None where there are none in some."""
-        stated = []
+    def _stated(self, drawn: Observations) -> tuple[list[AbstractObservation], list[int]]:
+        """The poses that were planned, in each thing, one that was drawn where there are none; and their numbers."""
+        stated, numbers, first = [], list[int](), 0
         for thing, part in zip(self.things.values(), drawn, strict=True):
             rows = {name: row for row, name in enumerate(_places_of(part))}
             poses = [(q, rows[place]) for place, q in self.setup.planned if place in rows]
-            if not poses:
-                return None
-            q, of_places = np.array([q for q, _ in poses]), [row for _, row in poses]
-            stated.append(thing.recorded(self.problem.region, q, part.select(of_places)))
-        return stated
+            numbers += range(first, first + len(poses))
+            q = np.array([q for q, _ in poses] or np.asarray(part.q)[:1])
+            stated.append(thing.recorded(self.problem.region, q, part.select([row for _, row in poses] or [0])))
+            first += len(q)
+        return stated, numbers
 
     def _near(self, parts: Observations) -> list[AbstractObservation]:
         """Other poses near to the planned ones, which are the first candidates, in each thing."""

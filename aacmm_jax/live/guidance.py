@@ -19,21 +19,22 @@ from ..calibration.task import without_lengths
 from ..core.distributions import f_tail, student_quantile
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
-from ..kinematics.arm import Arm, correction_names
+from ..kinematics.arm import Arm
 from ..kinematics.chain import reading_units
 from ..kinematics.parameters import Bounds, Parameters
 from ..kinematics.priors import Prior, default_prior
 from ..kinematics.workspace import reached
 from ..model.observed import Observed
 from ..pipeline.single import calibrate, identify
-from ..planning.designs import Candidates, covariance_of
+from ..planning.designs import Candidates
 from ..planning.kit_placement import rows_by_pose, rows_of_relations
 from ..planning.motion import approaches, joint_weights, move_contacts
+from ..planning.placement import LEAST_POSES
 from ..planning.problem import PRIOR, PlanOptions
 from ..uncertainty.coverage import LEVEL
 from ..uncertainty.linearisation import Linearisation
 from .candidates import Search
-from .limits import Progress, gained, progress
+from .limits import gained, progress
 from .places import Setup, TakenPose, capture_of
 
 _FREEDOM = 4.0  # degrees of freedom that the usual noise counts
@@ -139,7 +140,9 @@ class Guide:
         again = None if guidance is None else guidance.again
         if again is not None and place in (None, again.place) and guidance is not None:
             away = float(np.linalg.norm(guidance.poses[again.number].residual))
-            return self._proposed(again.place, again.q, f"Pose {again.number} is {away:.2g} mm off: take it again.", q, None)
+            return self._proposed(
+                again.place, again.q, f"Pose {again.number} is {away:.2g} mm off: take it again.", q, None
+            )
         pool = self.search.pool()
         known, ahead = (pool.candidates, self.search.planned) if guidance is None else (guidance.known, guidance.ahead)
         here = place if place is not None else None if guidance is None else guidance.last
@@ -196,9 +199,7 @@ class Guide:
         bounds, options = Bounds(problem.space, -endless, endless), {"start": self._start, "noise": problem.noise}
         options |= {"prior": self._prior, "replace_noise": False}
         if capture.lengths or fixes_scale(capture):
-            result = calibrate(
-                problem.arm, capture, bounds, **options, shared_errors=False, undetermined="ignore"
-            )
+            result = calibrate(problem.arm, capture, bounds, **options, shared_errors=False, undetermined="ignore")
         else:  # the prior holds the scale
             result = identify(problem.arm, capture, bounds, **options, hold=None)
         vector = np.asarray(result.parameters)
@@ -229,13 +230,17 @@ class Guide:
     def _guidance(self, poses: Sequence[TakenPose], solution: "_Solution") -> Guidance:
         newest = max(poses, key=lambda pose: pose.number)
         self._drop_taken(newest, solution)
-        found = progress(self.search, solution.known, solution.taken, solution.scale, self._ahead, self.target)
+        used = [pose for pose in poses if pose.number not in self._wrong and pose.session == newest.session]
+        counts = np.array([sum(pose.place == place.name for pose in used) for place in self.setup.places])
+        found = progress(
+            self.search, solution.known, solution.taken, solution.scale, self._ahead,
+            np.maximum(LEAST_POSES - counts, 0), self.target,
+        )  # fmt: skip
         self._ahead = found.ahead
         by_number = solution.residuals()
         positions: dict[str, Any] = {}
         for place in self.setup.places:
-            own = [pose for pose in poses if pose.place == place.name and pose.number not in self._wrong]
-            own = [pose for pose in own if pose.session == newest.session]
+            own = [pose for pose in used if pose.place == place.name]
             if own and place.position is not None:
                 positions[place.name] = np.mean([by_number[pose.number].tip for pose in own], axis=0)
         again = newest if newest.number in self._wrong else None
@@ -295,9 +300,9 @@ class _Solution(NamedTuple):
         # Unknowns of the candidates first, then those of other sessions.
         index, size = np.arange(len(linear.z)), count
         for name, at in linear.observed.positions.items():
-            if name not in pool.columns:
-                size += len(at)
-            index[p + at] = pool.columns.get(name, np.arange(size - len(at), size))
+            there = pool.columns.get(name)
+            size += len(at) if there is None else 0
+            index[p + at] = np.arange(size - len(at), size) if there is None else there
 
         def wider(rows: np.ndarray) -> np.ndarray:
             whole = np.zeros((*rows.shape[:-1], size))
@@ -316,7 +321,8 @@ class _Solution(NamedTuple):
         parts = linear.parts()
         white = np.zeros(rows.shape[:2])
         for part in parts:
-            white[part.poses, : len(part.white)] = np.asarray(part.white).T
+            residual = np.asarray(part.white)
+            white[part.poses, : len(residual)] = residual.T
         h = np.einsum("mrp,msp->mrs", rows @ np.linalg.inv(known.base), rows)
         equations = np.concatenate([part.observation.pose_equations for part in parts])
         squares = _FREEDOM + float(np.sum(white[used] ** 2))
@@ -338,7 +344,9 @@ class _Solution(NamedTuple):
             freedom = max(self.freedom - own[1], 1.0)
             ratios[i] = squares[i] / count[i] / (max(self.squares - own[0], _FREEDOM) / freedom)
             probabilities[i] = f_tail(ratios[i], int(count[i]), freedom)
-        still = {int(n) for n, p, used in zip(self.numbers, probabilities, self.used, strict=True) if not used and p < _RIGHT}
+        still = {
+            int(n) for n, p, used in zip(self.numbers, probabilities, self.used, strict=True) if not used and p < _RIGHT
+        }
         wrong = self.used & (probabilities * len(squares) < _WRONG)
         if wrong.any():
             worst = int(np.argmax(np.where(wrong, ratios, 0.0)))
@@ -350,7 +358,7 @@ class _Solution(NamedTuple):
 
     def residuals(self) -> dict[int, PoseResidual]:
         """The residual of every pose, mm."""
-        found, tips = {}, self.linear.point.forward.tip.T
+        found, tips = {}, np.asarray(self.linear.point.forward.tip).T
         sd = np.sqrt(self.squares / self.freedom)
         for part in self.linear.parts():
             rows, (observation, by_tip) = len(part.values), (part.observation, np.asarray(part.by_tip))
@@ -365,8 +373,3 @@ class _Solution(NamedTuple):
                 number = int(self.numbers[at])
                 found[number] = PoseResidual(tips[at], residual[i], float(u[i]), not bool(self.used[at]))
         return found
-
-
-def positions_covariance(known: Candidates) -> Float[np.ndarray, "p p"]:
-    """Covariance of the parameters, in natural steps."""
-    return covariance_of(known.base, known.parameters)

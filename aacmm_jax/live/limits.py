@@ -1,10 +1,11 @@
 """How far a capture is: U of a length so far and after ten more poses, and what limits it."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..core.text import pluralise
 from ..planning.designs import Candidates, covariance_of
@@ -14,6 +15,7 @@ from .candidates import TEN, Search
 _ENDLESS = 1e6  # times the information of the poses so far: as many poses in these places as anybody likes
 _CLOSE = 0.8  # part of U that is left with any number of poses, from which more poses hardly help
 _UNKNOWN = 3.0  # mm: a length known no better follows from the prior alone
+_MANY = 100  # poses, above which no number is predicted
 _SHARE = 0.3  # part of the variance that is named
 
 
@@ -30,7 +32,7 @@ class Progress(NamedTuple):
 
 def progress(
     search: Search, known: Candidates, taken: Float[np.ndarray, "P P"], scale: float, ahead: Sequence[int],
-    target: float | None,
+    least: Int[np.ndarray, " s"], target: float | None,
 ) -> Progress:  # fmt: skip
     """How far a capture is.
 
@@ -40,31 +42,34 @@ def progress(
         taken: The part of it that the poses give.
         scale: Factor from standard uncertainties by the usual noise to U.
         ahead: The poses that were planned before.
+        least: Poses that each place still needs.
         target: U that is asked for, mm.
     """
     u = scale * search.u(known.base)
     floor = scale * search.u(known.base + _ENDLESS * taken)
-    reachable = target is not None and floor < target
-    met = target is not None and u <= target
-    planned = search.ahead(known, ahead, target / scale if target is not None and reachable and not met else None)
+    met, determined = target is not None and u <= target, u < _UNKNOWN * scale
+    aim = target / scale if target is not None and determined and floor < target and not met else None
+    planned = search.ahead(known, ahead, least, aim)
     after = scale * search.u(search.ten(known, planned))
-    if u > _UNKNOWN * scale:
-        return Progress(None, after if after < _UNKNOWN * scale else None, _unknown(search, known, planned), False, planned)
+    if not determined:
+        limits = f"These poses do not determine lengths yet; {_least_known(search, known)}"
+        return Progress(None, after if after < _UNKNOWN * scale else None, limits, False, planned)
     length = f"U of {search.problem.check_length:.0f} mm"
     if met:
         return Progress(u, after, f"{length} is {u:.2g} mm: the target of {target:.2g} mm is met.", True, planned)
     if floor > (_CLOSE * u if target is None else target):
-        limits = f"More poses in these places leave {length} at {floor:.2g} mm: {_of_floor(search, known, taken, scale, floor)}"
+        remedy = _of_floor(search, known, taken, scale, floor)
+        limits = f"More poses in these places leave {length} at {floor:.2g} mm: {remedy}"
     elif target is not None:
-        count = len(planned)
-        limits = f"About {pluralise(count, 'more pose')} will reach {length} = {target:.2g} mm; {_least_known(search, known)}"
+        # u^2 less what is left with any number of poses falls as one over their number.
+        reached = scale * search.u(known.information(known.rows[planned]))
+        factor = (reached**2 - floor**2) / (target**2 - floor**2)
+        count = max(math.ceil(len(planned) * max(factor, 1.0)), 1)
+        words = f"About {pluralise(count, 'more pose')}" if count <= _MANY else f"More than {_MANY} more poses"
+        limits = f"{words} will reach {length} = {target:.2g} mm; {_least_known(search, known)}"
     else:
         limits = f"{length} falls to {after:.2g} mm with {TEN} more poses; {_least_known(search, known)}"
     return Progress(u, after, limits, False, planned)
-
-
-def _unknown(search: Search, known: Candidates, planned: Sequence[int]) -> str:
-    return f"These poses do not determine lengths yet; {_least_known(search, known)}"
 
 
 def _of_floor(search: Search, known: Candidates, taken: np.ndarray, scale: float, floor: float) -> str:

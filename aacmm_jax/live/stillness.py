@@ -117,6 +117,10 @@ class Stillness:
             return
         most = max(1.5 * float(np.median(self._known_long)), 0.15) if self._known_long else _CREEP
         stopped = long is not None and bool(np.any(long.scatter > _STOPPED * np.maximum(short.scatter, floor)))
+        if self._known and not stopped and len(self._times) >= 2 * count:
+            before = _Polynomials.of(self._times[-2 * count : -count], self._q[-2 * count : -count])
+            usual = before.squares[0] / np.maximum(np.median(self._known, axis=0)[0], floor**2)
+            stopped = float(np.mean(usual)) > _ENDED * _DRIFT
         usual_rest = drift < _DRIFT and whole < _WHOLE and (stopped or creep < _CREEP)
         self._agreed = self._agreed + 1 if usual_rest or creep < min(most, _CREEP) else 0
         if self._agreed >= _AGAIN:
