@@ -25,8 +25,8 @@ from ..kinematics.robots import together
 from ..kinematics.workspace import Reach
 from ..model.robot_bases import with_found_bases
 from .arms import arm_beside, for_capture, read_arm, usual_noise
+from .controllers.lerobot import angles_by_motors
 from .inputs import InputFile
-from .lerobot_motors import angles_by_motors
 from .manifest_pixels import Cameras, Detecting, Progress, observations_of, without_progress
 from .manifest_readings import Readings, points_of
 from .manifest_rows import Source, name_of, parts
