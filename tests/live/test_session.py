@@ -132,7 +132,7 @@ def test_a_place_that_was_said_counts(session, device):
 
 
 def test_a_session_is_continued_with_the_same_capture(tmp_path):
-    path, state = tmp_path / "c.h5", None
+    path, state, last = tmp_path / "c.h5", None, np.zeros(ARM.joints)
     for name in ("A", "bar/1"):
         device = Scripted()
         with aj.live.Session(SETUP, [device], path=path) as session:
