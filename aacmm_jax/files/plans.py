@@ -180,7 +180,7 @@ def plan_manifest(
     readings of prismatic joints are in mm. ``urdf``: where the arm is a URDF, its links. ``targets``: the targets of
     cameras, as in the kit.
     """
-    entries: dict[str, Any] = {"arm": arm} | ({} if urdf is None else {"base": urdf.base, "tip": urdf.tip})
+    entries: dict[str, Any] = {"arm": arm} | ({} if urdf is None else urdf.links)
     what, tables, size = _WHAT[type(plan)], [], []
     if isinstance(plan, Plan):
         tables += [("socket", {"name": name, "file": f"{name}.csv"}) for name in plan.sockets]

@@ -1,7 +1,7 @@
 """What devices give: one reading of a moment, of the joints, of an instrument, or of both."""
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -28,3 +28,13 @@ class Sample(NamedTuple):
     q: Float[np.ndarray, " n"] | None = None
     columns: Mapping[str, float] = {}
     measured: Mapping[str, Float[np.ndarray, "..."] | Int[np.ndarray, "..."]] = {}
+
+
+def mean_measured(measured: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
+    """What instruments saw of one pose: the mean of points and distances, the last of rotations and corners."""
+    values: dict[str, np.ndarray] = {}
+    for name in dict.fromkeys(name for one in measured for name in one):
+        rows = [np.asarray(one[name]) for one in measured if name in one]
+        averaged = name in ("points", "values")
+        values[name] = np.mean(rows, axis=0) if averaged else rows[-1]
+    return values

@@ -8,7 +8,7 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +26,12 @@ from .devices import open_device
 from .devices.device import AbstractDevice
 from .journal import Journal, journal_of
 from .places import COLUMNS, Place, Setup, TakenPose, capture_of
-from .samples import Sample
+from .samples import Sample, mean_measured
 from .shown import headline, links_of, shown_readings, state_of
 from .stillness import Rest, Stillness
 
 _LOOK_EVERY = 0.1  # s of rest
+_MOST_MEASURED = 500
 _APART = 0.02  # rad, or m of prismatic joints: least change of a joint between two poses that are taken by themselves
 _LONGEST_TEXT = 200
 
@@ -87,8 +88,9 @@ class Session:
         self._shown: tuple[int, dict[str, Any]] = -1, {}  # the version, and what is seen of it
         self._q: Float[np.ndarray, " n"] | None = None
         self._columns: dict[str, float] = {}
-        self._measured: dict[str, Any] = {}
+        self._measured: list[Mapping[str, Any]] = []  # what instruments have seen since the arm is at rest
         self._sample_times: deque[float] = deque(maxlen=50)
+        self._sample_time = -np.inf
         self._taken_until = -np.inf  # time of the device up to which rest has been used
         self._looked_at = -np.inf  # and when it was last looked at
         self._taken_q: Float[np.ndarray, " n"] | None = None
@@ -96,6 +98,7 @@ class Session:
         self._button = False
         self._journal, self._closed = Journal(journal_of(self.path)), False
         self._devices: list[AbstractDevice] = []
+        self._threads: list[threading.Thread] = []
         try:
             self._captured.resume(self._journal)
             self._devices = [open_device(d, setup) if isinstance(d, str) else d for d in devices]
@@ -103,10 +106,11 @@ class Session:
         except BaseException:
             self.close()
             raise
-        self._reader = threading.Thread(target=self._read_devices, name="live devices", daemon=True)
-        self._worker = threading.Thread(target=self._compute, name="live guidance", daemon=True)
-        self._reader.start()
-        self._worker.start()
+        self._threads = [threading.Thread(target=self._compute, name="live guidance", daemon=True)]
+        for device in self._devices:  # each its own: one that cannot be reached holds up no other
+            self._threads.append(threading.Thread(target=self._read_device, args=(device,), daemon=True))
+        for thread in self._threads:
+            thread.start()
         self._wake.set()
 
     # What people do.
@@ -181,9 +185,8 @@ class Session:
         """Stop; everything is on disk already."""
         self._stop.set()
         self._wake.set()
-        for name in ("_reader", "_worker"):
-            thread = getattr(self, name, None)
-            if thread is not None and thread is not threading.current_thread():
+        for thread in self._threads:
+            if thread is not threading.current_thread():
                 thread.join(5.0)
         for device in self._devices:
             device.close()
@@ -269,7 +272,7 @@ class Session:
         return np.array(links_of(self._where.arm, q)[-1])
 
     def _take(self, rest: Rest, place: Place) -> int:
-        measured = dict(self._measured) if place.is_free else {}
+        measured = mean_measured(self._measured) if place.is_free else {}
         columns = {name: value for name, value in self._columns.items() if name != "button"}
         if self._captured.temperature is not None:
             columns[COLUMNS["thermometer"]] = self._captured.temperature
@@ -286,31 +289,33 @@ class Session:
 
     # The threads.
 
-    def _read_devices(self) -> None:
+    def _read_device(self, device: AbstractDevice) -> None:
         while not self._stop.is_set():
-            any_came = False
-            for device in self._devices:
-                samples = device.read()
-                if self._stream is not None and (raw := device.raw()):
+            samples = device.read()
+            raw = b"" if self._stream is None else device.raw()
+            if not samples and not raw:
+                continue
+            with self._lock, contextlib.suppress(InputError):
+                if self._stream is not None:
                     self._stream.write(raw)
-                any_came = any_came or bool(samples)
-                if samples:
-                    with self._lock, contextlib.suppress(InputError):
-                        self._add(samples)
-            if not any_came:
-                time.sleep(0.002)
+                self._add(samples)
 
     def _add(self, samples: Iterable[Sample]) -> None:
         pressed = False
         for sample in samples:
             self._columns |= sample.columns
             if sample.measured:
-                self._measured = dict(sample.measured)
+                self._measured = [*self._measured[-_MOST_MEASURED:], sample.measured]
             button = bool(self._columns.get("button", 0))
             pressed, self._button = pressed or (button and not self._button), button
             if sample.q is not None:
                 self._q = sample.q
+                if sample.time < self._sample_time:  # the device's clock began anew
+                    self._stillness, self._taken_until, self._looked_at = Stillness(self._arm.joints), -np.inf, -np.inf
+                self._sample_time = sample.time
                 self._stillness.add(sample)
+                if self._stillness.rest is None:
+                    self._measured = []
                 self._sample_times.append(sample.time)
                 self._take_by_itself()
         if pressed:
