@@ -69,7 +69,7 @@ def so101(folder: Path) -> tuple[object, ...]:
 
 
 def scara(folder: Path) -> tuple[object, ...]:
-    aj.files.save_arm(folder / "scara.toml", SCARA, "SCARA")
+    aj.files.save_arm(SCARA, folder / "scara.toml", name="SCARA")
     return (folder / "scara.toml",)
 
 
