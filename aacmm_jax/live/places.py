@@ -21,6 +21,7 @@ from ..data.observations.observation import AbstractObservation
 from ..data.observations.pixels import Pixels
 from ..data.observations.simulated import AbstractSimulated
 from ..data.observations.simulated_pixels import SimulatedPixels
+from ..data.targets import AbstractTarget
 from ..kinematics.arm import Arm
 from ..kinematics.beside import BY_JOINT
 from ..kinematics.parameters import ArmSpecification
@@ -84,6 +85,7 @@ class Setup(NamedTuple):
     places: tuple[Place, ...]
     lengths: tuple[ReferenceLength, ...] = ()
     planned: tuple[tuple[str, Float[np.ndarray, " n"]], ...] = ()  # name of the place and readings, in order
+    targets: Mapping[str, AbstractTarget] = {}  # that cameras see, by name
 
     def place(self, name: str) -> Place:
         """The place of a name; `InputError` where there is none."""
