@@ -24,6 +24,15 @@ class AbstractDevice(abc.ABC):
         message: What is wrong at present; empty where nothing is.
         lines: How many lines, messages or images were read.
         bad: How many of these could not be used, by reason.
+
+    Example:
+        >>> class Resting(aj.live.AbstractDevice):
+        ...     joints, connected = 6, True
+        ...
+        ...     def read(self):
+        ...         return [aj.live.Sample(0.0, np.zeros(6))]
+        >>> print(len(Resting("an arm at rest").read()))
+        1
     """
 
     name: str

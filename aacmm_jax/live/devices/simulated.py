@@ -44,6 +44,7 @@ _OPTIONS = {
 }
 _FASTEST = 1.2  # rad/s, or m/s of prismatic joints
 _AHEAD = 0.5  # s that are computed at once
+_TRIES = 12
 
 
 def open_device(where: str, options: Mapping[str, str], setup: Setup) -> "Simulated":
@@ -142,8 +143,14 @@ class Simulated(AbstractDevice):
             direction = self.random.normal(size=3)
             shift = shift + self.options["off"] * direction / np.linalg.norm(direction)
         target = (self.positions[place.name] + shift)[None]
-        found, arrived = project_to_targets(self.true, self._columns(q)[None], target, self.limits)
-        return (found[0, : self.joints], True) if arrived[0] else (q, False)
+        starts = self._columns(
+            q
+            + np.outer(np.linspace(0, 0.5, _TRIES), np.ones(self.joints))
+            * self.random.normal(size=(_TRIES, self.joints))
+        )
+        found, arrived = project_to_targets(self.true, starts, np.tile(target, (_TRIES, 1)), self.limits)
+        first = int(np.argmax(arrived))  # the nearest to what was asked for that is possible
+        return (found[first, : self.joints], True) if arrived[first] else (q, False)
 
     def _columns(self, q: np.ndarray) -> np.ndarray:
         """Readings with what the arm takes beside them."""
