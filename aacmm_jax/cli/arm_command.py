@@ -208,10 +208,9 @@ def _check_summary(
     from ..files.reading_checks import angles_toml, units_toml
 
     angles = check.couplings or (check.explained and check.best.hypothesis._replace(length=1.0).changes)
-    explanation = check.given if check.couplings else check.best
     return reading_check_summary(check, specification.name, unit=unit, positions=positions) | {
-        "angles": angles_toml(explanation, unit, manifest, check.couplings) if angles else None,
-        "units": units_toml(check.best, positions) if check.explained else None,
+        "angles": angles_toml(check.best, unit, manifest, check.couplings) if angles else None,
+        "units": units_toml(check.best, positions) if check.explained or check.couplings else None,
         "standing": standing_rows(specification.arm, capture, nominal),
         "reading_sets": [],
         "reading_sets_sentence": "",

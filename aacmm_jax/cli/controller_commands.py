@@ -315,8 +315,9 @@ def correct(
         "Unit of positions if the column header does not state it (as x_m does). Default: mm."
     ),
     near: str | None = option(
-        "For positions with orientations: start the search for the joint readings from these readings. Default: the "
-        "columns q_1, q_2, ... of the table.",
+        "For a table of positions: readings from which the search for the joint readings starts, in the configuration "
+        "(elbow, wrist) in which the arm is to be; positions without orientations keep the orientation of these "
+        "readings. Default: the columns q_1, q_2, ... of the table.",
         "Q1,Q2,...",
     ),
     probe: str | None = option(

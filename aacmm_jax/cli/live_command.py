@@ -37,8 +37,8 @@ def live(
     capture_only: bool = flag("--capture-only", "Do not calibrate when the capture is finished."),
     keep_stream: Path | None = option("Also append everything that the devices send to this file.", "FILE"),
     port: int = option("Port of the page. Default: a free one.", "N", default=0, min=0, max=65535),
-    token: str | None = option(
-        "Also serve the page to other computers, which must give this text (at least 16 characters).", "TEXT"
+    token: bool = flag(
+        "--token", "Also serve the page to other computers; its address ends with a random token, which they need."
     ),
     no_browser: bool = flag("--no-browser", "Print the address of the page, and do not open a browser."),
     base: str | None = options.BASE_LINK,
@@ -72,9 +72,10 @@ def live(
         typer.echo(f"{poses} poses are kept in {output}.journal; run the same command to go on.")
 
 
-def _serve(session: Any, port: int, token: str | None, browser: bool) -> None:
+def _serve(session: Any, port: int, others: bool, browser: bool) -> None:
     """Show the page until the command is interrupted."""
     import contextlib
+    import secrets
     import socket
     import threading
 
@@ -82,10 +83,11 @@ def _serve(session: Any, port: int, token: str | None, browser: bool) -> None:
 
     from ..live.server import opened, serving
 
-    host = "127.0.0.1" if token is None else "0.0.0.0"
-    with serving(session, host=host, port=port, token=token) as address, contextlib.ExitStack() as stack:
+    # A token of the user's own would stand in the list of processes, where other users read it.
+    where = {"host": "0.0.0.0", "token": secrets.token_urlsafe(24)} if others else {}
+    with serving(session, port=port, **where) as address, contextlib.ExitStack() as stack:
         typer.echo(f"The page is at {address} (Ctrl-C ends).")
-        if token is not None:
+        if others:
             typer.echo(f"From other computers: {address.replace('127.0.0.1', socket.gethostname(), 1)}")
         if browser and not stack.enter_context(opened(address)):
             typer.echo("No browser was found here; open the address in one.")

@@ -1,7 +1,5 @@
 from .devices import open_device as open_device
 from .devices.device import AbstractDevice as AbstractDevice
-from .devices.line_format import LineFormat as LineFormat
-from .devices.line_format import format_of_lines as format_of_lines
 from .places import Place as Place
 from .places import Setup as Setup
 from .places import TakenPose as TakenPose

@@ -83,7 +83,10 @@ class Journal:
 
     def append(self, event: Mapping[str, Any]) -> None:
         """Write one event; it is on the disk when this returns. `InputError` where the disk refuses."""
-        text = json.dumps(event, default=_plain, allow_nan=False, ensure_ascii=True)
+        try:
+            text = json.dumps(event, default=_plain, allow_nan=False, ensure_ascii=True)
+        except ValueError as error:
+            raise InputError("a value of this pose is not finite, so it is not recorded; take it again.") from error
         number = len(self.events) + 1
         line = f"{number} {_checksum(number, text)} {text}\n".encode()
         try:

@@ -21,6 +21,7 @@ from ..data.observations.observation import AbstractObservation
 from ..data.observations.pixels import Pixels
 from ..data.observations.simulated import AbstractSimulated
 from ..data.observations.simulated_pixels import SimulatedPixels
+from ..data.targets import AbstractTarget
 from ..kinematics.arm import Arm
 from ..kinematics.beside import BY_JOINT
 from ..kinematics.parameters import ArmSpecification
@@ -42,6 +43,15 @@ class Place(NamedTuple):
         position: Where the tip is expected, in the base frame ``(3,)``, mm; None where it may be anywhere.
         wanted: How many poses a plan has here.
         item: The item of the kit that it belongs to, with its cone.
+
+    Example:
+        >>> specification = aj.files.load_specification("cheng2018-simulation")
+        >>> noise = aj.files.load_noise("cheng2018-simulation")
+        >>> cone = aj.data.observations.SimulatedSocket("A", (400, 200, 300), 5)
+        >>> setup = aj.live.setup_of(specification, noise, [cone])
+        >>> place = setup.places[0]
+        >>> print(place.name, place.kind, place.position, place.wanted)
+        A socket [400. 200. 300.] 5
     """
 
     name: str
@@ -63,7 +73,13 @@ class Place(NamedTuple):
 
 
 class TakenPose(NamedTuple):
-    """A pose as it was taken: mean readings of a moment of rest."""
+    """A pose as it was taken: mean readings of a moment of rest.
+
+    Example:
+        >>> pose = aj.live.TakenPose(1, "A", 0.0, np.zeros(6), np.full(6, 1e-5))
+        >>> print(pose.place, pose.session, pose.excluded)
+        A 1 False
+    """
 
     number: int
     place: str
@@ -77,13 +93,22 @@ class TakenPose(NamedTuple):
 
 
 class Setup(NamedTuple):
-    """What a live capture is of: the arm, the places, the certified lengths between sockets, and a plan, if any."""
+    """What a live capture is of: the arm, the places, the certified lengths between sockets, and a plan, if any.
+
+    Example:
+        >>> from pathlib import Path
+        >>> _ = Path("cone.toml").write_text('socket = [{ name = "A", point = [400, 200, 300] }]')
+        >>> setup = aj.live.read_setup("cheng2018-simulation", kit="cone.toml")
+        >>> print(setup.specification.arm.joints, setup.place("A").kind)
+        6 socket
+    """
 
     specification: ArmSpecification
     noise: ArmNoise
     places: tuple[Place, ...]
     lengths: tuple[ReferenceLength, ...] = ()
     planned: tuple[tuple[str, Float[np.ndarray, " n"]], ...] = ()  # name of the place and readings, in order
+    targets: Mapping[str, AbstractTarget] = {}  # that cameras see, by name
 
     def place(self, name: str) -> Place:
         """The place of a name; `InputError` where there is none."""
@@ -101,6 +126,16 @@ def setup_of(
     planned: Iterable[tuple[str, Any]] = (),
 ) -> Setup:
     """The places of a kit: each socket, each point of each placement of an artefact, and each instrument.
+
+    Args:
+        specification: The arm, as `files.load_specification` reads it.
+        noise: What is usual for it, as `files.load_noise` reads it.
+        kit: Observations to simulate, where they stand, or `planning.KitItem`, whose placements are found live.
+        lengths: Certified lengths between sockets.
+        planned: Name of the place and readings, rad, or mm of prismatic joints, of each pose of a plan.
+
+    Raises:
+        InputError: The kit is empty.
 
     Example:
         >>> bar = aj.data.observations.SimulatedArtefact("bar", {"1": (400, 0, 200), "2": (700, 0, 200)}, 5, u=0.001)
@@ -168,8 +203,24 @@ def row_of_readings(arm: Arm, pose: TakenPose) -> Float[np.ndarray, " columns"]:
 def capture_of(setup: Setup, poses: Sequence[TakenPose]) -> tuple[Capture, list[int]]:
     """The capture of some poses, and the number of the pose in each of its rows, in the order of `Capture.readings`.
 
-    Poses that are excluded do not count; sessions are joined with a probe each. Poses that are equal to the bit, which
-    only a simulation without noise has, are one.
+    Poses that are excluded do not count; sessions are joined with a probe each.
+
+    Args:
+        setup: The arm and the places.
+        poses: The poses, in any order.
+
+    Raises:
+        InputError: There is no pose, or one lacks what an instrument should have measured.
+
+    Example:
+        >>> specification = aj.files.load_specification("cheng2018-simulation")
+        >>> noise = aj.files.load_noise("cheng2018-simulation")
+        >>> cone = aj.data.observations.SimulatedSocket("A", (400, 200, 300), 5)
+        >>> setup = aj.live.setup_of(specification, noise, [cone])
+        >>> poses = [aj.live.TakenPose(i, "A", 0.0, np.full(6, 0.1 * i), np.zeros(6)) for i in (1, 2)]
+        >>> capture, numbers = aj.live.capture_of(setup, poses)
+        >>> print(capture.names, capture.sizes, numbers)
+        ('A',) (2,) [1, 2]
     """
     kept = [pose for pose in poses if not pose.excluded]
     if not kept:
@@ -197,7 +248,7 @@ def _of_one_session(setup: Setup, poses: Sequence[TakenPose]) -> tuple[Capture, 
     of_others: list[int] = []
     for name, places in by_thing(setup).items():
         thing = places[0].thing
-        own = [pose for place in places for pose in poses if pose.place == place.name]
+        own = _different([pose for place in places for pose in poses if pose.place == place.name])
         if not own:
             continue
         q = np.array([row_of_readings(arm, pose) for pose in own])
@@ -209,6 +260,15 @@ def _of_one_session(setup: Setup, poses: Sequence[TakenPose]) -> tuple[Capture, 
             of_others += [pose.number for pose in own]
     lengths = [length for length in setup.lengths if length.start in sockets and length.end in sockets]
     return Capture(sockets, lengths, observations), (of_sockets, of_others)
+
+
+def _different(poses: Sequence[TakenPose]) -> list[TakenPose]:
+    """Poses without copies that are equal to the bit, as coarse encoders give, which a `Capture` counts once."""
+
+    def key(pose: TakenPose) -> tuple[Any, ...]:
+        return (pose.place, pose.q.tobytes(), *(np.asarray(value).tobytes() for value in pose.measured.values()))
+
+    return list({key(pose): pose for pose in reversed(poses)}.values())[::-1]
 
 
 def by_thing(setup: Setup) -> dict[str, list[Place]]:

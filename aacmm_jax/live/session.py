@@ -3,7 +3,6 @@
 Everything that people see is `Session.state`; everything that they do is a method.
 """
 
-import contextlib
 import os
 import threading
 import time
@@ -101,6 +100,9 @@ class Session:
         self._threads: list[threading.Thread] = []
         try:
             self._captured.resume(self._journal)
+            self._where = Whereabouts(setup, self._arm, self._captured.poses, None)
+            if self._captured.poses:  # an arm that still is where it was when the last process ended is not taken again
+                self._taken_q = self._captured.poses[-1].q
             self._devices = [open_device(d, setup) if isinstance(d, str) else d for d in devices]
             self._check_devices()
         except BaseException:
@@ -262,6 +264,11 @@ class Session:
                     "its line format, or name the right arm."
                 )
 
+    def _say(self, error: Exception) -> None:
+        if self._message != in_words(error):
+            self._message = in_words(error)
+            self._changed()
+
     def _place_at(self, tip: Float[np.ndarray, " 3"]) -> Place | None:
         """The place that the tip is in: the one that was said, else the one that its position says."""
         if self._forced is not None:
@@ -295,10 +302,13 @@ class Session:
             raw = b"" if self._stream is None else device.raw()
             if not samples and not raw:
                 continue
-            with self._lock, contextlib.suppress(InputError):
-                if self._stream is not None:
-                    self._stream.write(raw)
-                self._add(samples)
+            with self._lock:
+                try:
+                    if self._stream is not None:
+                        self._stream.write(raw)
+                    self._add(samples)
+                except Exception as error:  # whatever one device sends, the others are read on
+                    self._say(error)
 
     def _add(self, samples: Iterable[Sample]) -> None:
         pressed = False
@@ -349,8 +359,8 @@ class Session:
                 found = guide.calibrated(poses)
                 proposed = guide.next_pose(found, q, forced)
                 message = ""
-            except InputError as error:
-                found, proposed, message = None, None, str(error)
+            except Exception as error:  # poses are taken without guidance, too
+                found, proposed, message = None, None, in_words(error)
             with self._lock:
                 self._where = Whereabouts(self.setup, self._arm, self._captured.poses, found)
                 self._next, self._message = proposed, message
@@ -365,15 +375,21 @@ class Session:
         from ..report import write_report
 
         capture, _ = capture_of(self.setup, poses)
-        measured = time.strftime("%Y-%m-%d")
-        recording = Recording(capture, self.setup.specification, usual=self.setup.noise, measured=measured)
+        recording = Recording(
+            capture, self.setup.specification, usual=self.setup.noise, measured=time.strftime("%Y-%m-%d")
+        )
         save_capture(self.path, recording)
         paths = [str(self.path)]
         if calibrate:
-            record = calibrate_capture(recording)
+            scaled = capture.lengths or any(observation.fixes_scale for observation in capture.observations)
             calibration = self.path.with_name(f"{self.path.stem}-calibration.h5")
-            save_calibration(calibration, record)
+            save_calibration(calibration, calibrate_capture(recording, scale="measured" if scaled else "nominal"))
             page = calibration.with_suffix(".html")
             write_report(calibration, page)
             paths += [str(calibration), str(page)]
         return paths
+
+
+def in_words(error: Exception) -> str:
+    """The sentence of an error that says what to do; of any other, what failed."""
+    return str(error) if isinstance(error, InputError) else f"this failed ({type(error).__name__}: {error})"

@@ -133,7 +133,7 @@ class Feeder(threading.Thread):
         if self.connected() and self.random.uniform() < 0.7:
             self.source.send(checked_line(self.poses[0], self.number + 1)[:17])  # half a line
             self.spoilt["half"] += 1
-            time.sleep(0.1)
+        time.sleep(0.3)  # what is not read when a pseudo-terminal is closed is lost with it
         self.source.unplug()
         time.sleep(0.2)
         self.source.plug()

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.live.devices.line_format import CHECKSUMS, LONGEST
+from aacmm_jax.live.devices.line_format import CHECKSUMS, LONGEST, format_of_lines
 from tests.live.line_sources import Feeder, Pty, Server, columns
 
 ARM = aj.Arm(alpha=[0, np.pi / 2, 0], a=[0, 300, 300], d=[200, 0, 0], limits=[(-3, 3)] * 3)
 
 
 def read(line: bytes, **options: str):
-    sample, reason, missing = aj.live.format_of_lines("tcp:a:1", options, ARM).sample(line, 5.0)
+    sample, reason, missing = format_of_lines("tcp:a:1", options, ARM).sample(line, 5.0)
     return sample, reason, missing
 
 
@@ -76,7 +76,7 @@ def test_lines_that_begin_otherwise_are_passed_over():
 
 
 def test_numbers_of_lines_tell_what_is_missing_or_sent_twice():
-    written = aj.live.format_of_lines("tcp:a:1", {"columns": "number,q_1,q_2,q_3"}, ARM)
+    written = format_of_lines("tcp:a:1", {"columns": "number,q_1,q_2,q_3"}, ARM)
     answers = [written.sample(f"{number},1,2,3".encode(), 0.0)[1:] for number in (7, 8, 8, 11, 3, 4)]
     assert answers == [("", 0), ("", 0), ("sent twice", 0), ("", 2), ("", 0), ("", 0)]
 
@@ -91,7 +91,7 @@ def test_what_stands_beside_the_readings_and_what_instruments_see():
 
 
 def test_a_header_names_columns_and_unit():
-    written = aj.live.format_of_lines("file:a.csv", {}, ARM)
+    written = format_of_lines("file:a.csv", {}, ARM)
     assert written.sample(b"t,q_3_rad,q_1_rad,q_2_rad,note", 0.0) == (None, "", 0)
     np.testing.assert_allclose(written.sample(b"0,0.3,0.1,0.2,7", 0.0)[0].q, [0.1, 0.2, 0.3])
 
@@ -114,7 +114,7 @@ def test_a_header_names_columns_and_unit():
 )
 def test_formats_that_contradict_themselves_are_refused(options, says):
     with pytest.raises(aj.InputError, match=says):
-        aj.live.format_of_lines("tcp:a:1", options, ARM)
+        format_of_lines("tcp:a:1", options, ARM)
 
 
 def test_a_format_may_stand_in_a_file(tmp_path):

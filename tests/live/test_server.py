@@ -224,6 +224,19 @@ def test_pages_beyond_a_limit_are_refused_and_those_that_close_make_room(served)
         pytest.fail("no room for a page after others have closed")
 
 
+def test_connections_beyond_a_limit_are_closed_at_once(served):
+    with contextlib.ExitStack() as stack:
+        for _ in range(server._CONNECTIONS):
+            stack.enter_context(served.raw())
+        time.sleep(0.2)  # until the server has taken all of them
+        for _ in range(5):
+            with served.raw() as beyond:
+                beyond.settimeout(0.5 * server._IDLE)
+                assert beyond.recv(10) == b""
+    time.sleep(0.2)
+    assert served.ask()[0] == 200
+
+
 def test_silent_connections_are_closed_and_keep_nobody_out(monkeypatch):
     monkeypatch.setattr(server, "_IDLE", 0.5)
     with server.serving(session := StubSession()) as address:

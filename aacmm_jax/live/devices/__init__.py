@@ -25,6 +25,13 @@ def device_kinds() -> tuple[str, ...]:
 def open_device(text: str, setup: Setup) -> AbstractDevice:
     """The device that a text describes: ``kind:where?option=value&...``.
 
+    Args:
+        text: What it says.
+        setup: The arm that the device reads, and the places.
+
+    Raises:
+        InputError: The text is wrong, or an extra is not installed.
+
     Example:
         >>> specification = aj.files.load_specification("cheng2018-simulation")
         >>> cone = aj.data.observations.SimulatedSocket("A", (400, 200, 300), 5)

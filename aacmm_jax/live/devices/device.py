@@ -1,6 +1,7 @@
 """What every device has: what came since, what was bad of it, and whether it is connected."""
 
 import abc
+import math
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any
@@ -24,6 +25,15 @@ class AbstractDevice(abc.ABC):
         message: What is wrong at present; empty where nothing is.
         lines: How many lines, messages or images were read.
         bad: How many of these could not be used, by reason.
+
+    Example:
+        >>> class Resting(aj.live.AbstractDevice):
+        ...     joints, connected = 6, True
+        ...
+        ...     def read(self):
+        ...         return [aj.live.Sample(0.0, np.zeros(6))]
+        >>> print(len(Resting("an arm at rest").read()))
+        1
     """
 
     name: str
@@ -72,5 +82,7 @@ def numbers_of(where: str, options: Mapping[str, str], known: Mapping[str, float
         try:
             values[name] = number(text)
         except ValueError:
-            raise InputError(f"option {name} of device '{where}' is '{text}'; give a number.") from None
+            values[name] = math.nan
+        if not math.isfinite(values[name]):
+            raise InputError(f"option {name} of device '{where}' is '{text}'; give a number.")
     return values

@@ -209,15 +209,7 @@ class LineFormat:
 
 
 def format_of_lines(device: str, options: Mapping[str, str], arm: Arm) -> LineFormat:
-    """The format that the options of a device state: ``format=FILE.toml``, or its keys.
-
-    Example:
-        >>> ur = aj.load_arm("ur10e")
-        >>> written = aj.live.format_of_lines("tcp:robot:30010", {"unit": "rad", "checksum": "xor"}, ur)
-        >>> sample, reason, _ = written.sample(b"0,0.1,0,0,0,0*1D", 0.0)
-        >>> print(sample.q, reason)
-        [0.  0.1 0.  0.  0.  0. ]
-    """
+    """The format that the options of a device state: ``format=FILE.toml``, or its keys."""
     where = f"the line format of {device}"
     if "format" in options:
         if len(options) > 1:

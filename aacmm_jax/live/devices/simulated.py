@@ -44,6 +44,8 @@ _OPTIONS = {
 }
 _FASTEST = 1.2  # rad/s, or m/s of prismatic joints
 _AHEAD = 0.5  # s that are computed at once
+_IDLE = 0.1  # s that an operator without a goal waits for one
+_TRIES = 12
 
 
 def open_device(where: str, options: Mapping[str, str], setup: Setup) -> "Simulated":
@@ -109,18 +111,18 @@ class Simulated(AbstractDevice):
         # Time runs slower where the computer cannot keep up, and stands still while it sleeps.
         now = self._now = self._now + min(elapsed * self.options["speed"], _AHEAD)
         while self._clock < now:
-            self._compute(now)
+            self._compute()
         count = next((i for i, sample in enumerate(self._ready) if sample.time > now), len(self._ready))
         due, self._ready = self._ready[:count], self._ready[count:]
         self.lines += count
         return due
 
-    def _compute(self, now: float) -> None:
+    def _compute(self) -> None:
         """The next stretch: a motion to the goal and the hold there, or rest where the tip is."""
         try:
             self._place, q = self._goals.pop()
         except IndexError:
-            self._hold(min(_AHEAD, max(now - self._clock, 0.02)))
+            self._hold(_IDLE)
             return
         wanted, self._seated = self._there(q)
         self._move(wanted)
@@ -142,8 +144,14 @@ class Simulated(AbstractDevice):
             direction = self.random.normal(size=3)
             shift = shift + self.options["off"] * direction / np.linalg.norm(direction)
         target = (self.positions[place.name] + shift)[None]
-        found, arrived = project_to_targets(self.true, self._columns(q)[None], target, self.limits)
-        return (found[0, : self.joints], True) if arrived[0] else (q, False)
+        starts = self._columns(
+            q
+            + np.outer(np.linspace(0, 0.5, _TRIES), np.ones(self.joints))
+            * self.random.normal(size=(_TRIES, self.joints))
+        )
+        found, arrived = project_to_targets(self.true, starts, np.tile(target, (_TRIES, 1)), self.limits)
+        first = int(np.argmax(arrived))  # the nearest to what was asked for that is possible
+        return (found[first, : self.joints], True) if arrived[first] else (q, False)
 
     def _columns(self, q: np.ndarray) -> np.ndarray:
         """Readings with what the arm takes beside them."""

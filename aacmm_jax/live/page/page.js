@@ -109,6 +109,7 @@ $("thermometer").addEventListener("submit", (event) => {
 for (const button of document.querySelectorAll("[data-view]")) {
   button.addEventListener("click", () => view.look(...button.dataset.view.split(" ").map(Number)));
 }
+$("over").addEventListener("click", () => view.turnOver());
 
 function select(step) {
   const numbers = (state?.poses ?? []).map((pose) => pose.number);

@@ -13,6 +13,7 @@ export class View {
     this.zoom = 1;
     this.low = [-1, -1, 0];
     this.high = [1, 1, 1];
+    this.over = null; // whether the first axis points down, so that the picture is turned over
     this.frames = 0;
     this.scene = { places: [], poses: [], links: [], tip: null, ghost: null };
     new ResizeObserver(() => this.draw()).observe(canvas);
@@ -27,6 +28,11 @@ export class View {
 
   look(turn, tilt) {
     Object.assign(this, { turn, tilt, zoom: 1, low: [-1, -1, 0], high: [1, 1, 1] });
+    this.draw();
+  }
+
+  turnOver() {
+    this.over = !this.over;
     this.draw();
   }
 
@@ -87,12 +93,15 @@ export class View {
         this.high[i] = Math.max(this.high[i], point[i]);
       }
     }
+    // Some robots' first axis points down; few robots hang from a ceiling.
+    if (this.over === null && links.length) this.over = this.low[2] + this.high[2] < 0;
     this.middle = this.low.map((low, i) => (low + this.high[i]) / 2);
+    this.floor = this.over ? Math.max(this.high[2], 0) : Math.min(this.low[2], 0);
     this.extent = Math.max(Math.hypot(...this.low.map((low, i) => this.high[i] - low)) / 2, 1);
   }
 
   #project(point) {
-    const [x, y, z] = point.map((value, i) => (value - this.middle[i]) / this.extent);
+    const [x, y, z] = point.map((value, i) => (i && this.over ? -1 : 1) * (value - this.middle[i]) / this.extent);
     const c = Math.cos(this.turn), s = Math.sin(this.turn), ct = Math.cos(this.tilt), st = Math.sin(this.tilt);
     const across = c * x - s * y, away = s * x + c * y;
     const depth = ct * away - st * z, near = 1 / (1 + 0.22 * depth);
@@ -156,7 +165,7 @@ export class View {
 
   // The floor below everything, with a line every 100, 200 or 500 mm and so on, and the shadow of the arm.
   #floor() {
-    const z = Math.min(this.low[2], 0), size = 10 ** Math.floor(Math.log10(this.extent));
+    const z = this.floor, size = 10 ** Math.floor(Math.log10(this.extent));
     const step = [0.1, 0.2, 0.5, 1].map((part) => part * size).find((s) => this.extent / s < 7) ?? size;
     const from = this.low.map((low) => Math.floor(low / step - 0.5) * step);
     const to = this.high.map((high) => Math.ceil(high / step + 0.5) * step);
@@ -191,8 +200,8 @@ export class View {
     const { places, poses } = this.scene, { pen, colours } = this;
     for (const place of places) {
       if (!usable(place.position)) continue;
-      const at = this.#project(place.position), z = Math.min(this.low[2], 0);
-      const foot = this.#project([place.position[0], place.position[1], z]);
+      const at = this.#project(place.position);
+      const foot = this.#project([place.position[0], place.position[1], this.floor]);
       this.#stroke([at, foot], colours.line, 1, [2, 4]);
       this.strokes.push({ depth: at[2], paint: () => {
         const done = place.wanted && place.poses >= place.wanted, next = place.name === this.scene.next;
