@@ -28,7 +28,7 @@ def one_chain_of(record: Any, chain: str) -> Any:
     recording, own = record.recording, named_chain(record.recording.nominal.arm, chain)
 
     def part(specification: Any) -> Any:
-        urdf = specification.urdf and specification.urdf._replace(tip=chain)
+        urdf = specification.urdf and specification.urdf._replace(tips=(chain,))
         return specification._replace(arm=chain_of(specification.arm, chain).arm, urdf=urdf)
 
     whole = recording.capture

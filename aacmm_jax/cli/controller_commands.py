@@ -11,6 +11,7 @@ import typer
 from .. import files, kinematics, summaries
 from ..core.errors import InputError
 from ..core.text import printable, shorten
+from ..files.controllers import ZERO_FILES
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import check_kept, together, write_text
 from . import options
@@ -23,7 +24,7 @@ from .options import argument, flag, names_option, numbers_option, option, outpu
 _ROBOTS = ("urdf", "mjcf")
 _FORMATS = {".urdf": "urdf", ".xml": "mjcf", ".json": "json", ".csv": "csv", ".py": "python"}
 _FORMATS |= dict.fromkeys((".yaml", ".yml"), "ur")
-_ZEROS = {"lerobot": "--file CALIBRATION.json", "kuka": "--file MACHINE.DAT", "ros-calibration": ""}
+_ZEROS = ("lerobot", "kuka", "ros-calibration")  # all but the last need --file
 _OF_CAMERA = ("camera-info", "joint-origin", "static-transform", "opencv", "matrix")
 _OF_ONE_CHAIN = ("toml", "table", "offsets", "ur", "python", *_ZEROS)
 _OF_ONE_ARM = ("toml", *_ROBOTS, "table", "ur", "python")
@@ -124,9 +125,9 @@ def export(
         raise InputError(f"--camera and --frame apply to cameras only; give --format {', '.join(_OF_CAMERA)} too.")
     if frame is not None and written_as == "camera-info":
         raise InputError("--frame does not apply to --format camera-info; leave it out.")
-    if (file is not None) != bool(_ZEROS.get(written_as)) or (motors is not None and file is None):
-        asked = ", ".join(f"--format {name} {how}" for name, how in _ZEROS.items() if how)
-        raise InputError(f"--file is needed for these formats, and --motors and --file apply to no others: {asked}.")
+    if (file is not None) != (written_as in _ZEROS[:-1]) or (motors is not None and file is None):
+        formats = " and ".join(_ZEROS[:-1])
+        raise InputError(f"--file is needed for --format {formats}, and --motors and --file apply to no other format.")
     notes: list[str] = []
     with together(output):
         record = files.load_calibration(read := InputFile(calibration))
@@ -205,8 +206,7 @@ def _zeros_in_file(record: Any, form: str, file: Path | None, motors: str | None
             raise InputError(f"the nominal arm was not read from a URDF, which --format {form} needs; choose offsets.")
         written = files.ros_calibration(source, zeros)
     else:
-        change = files.lerobot_calibration if form == "lerobot" else files.kuka_machine_data
-        written = change(InputFile(file), zeros, None if motors is None else names_option(motors))
+        written = ZERO_FILES[form](InputFile(file), zeros, None if motors is None else names_option(motors))
     return written.text, [
         f"With these zero offsets, the tips of the nominal and the calibrated arm differ by {zeros.rms:.4f} mm RMS "
         f"({zeros.rms_nominal:.4f} mm without).",
@@ -329,8 +329,9 @@ def correct(
         "Unit of positions if the column header does not state it (as x_m does). Default: mm."
     ),
     near: str | None = option(
-        "For positions with orientations: start the search for the joint readings from these readings. Default: the "
-        "columns q_1, q_2, ... of the table.",
+        "For a table of positions: readings from which the search for the joint readings starts, in the configuration "
+        "(elbow, wrist) in which the arm is to be; positions without orientations keep the orientation of these "
+        "readings. Default: the columns q_1, q_2, ... of the table.",
         "Q1,Q2,...",
     ),
     probe: str | None = option(

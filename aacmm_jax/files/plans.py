@@ -190,9 +190,7 @@ def plan_manifest(
     readings of prismatic joints are in mm. ``urdf``: where the arm is a URDF, its links. ``targets``: the targets of
     cameras, as in the kit.
     """
-    entries: dict[str, Any] = {"arm": arm}
-    if urdf is not None:
-        entries |= {"base": urdf.base, "tip": urdf.tip if len(urdf.tips) == 1 else list(urdf.tips)}
+    entries: dict[str, Any] = {"arm": arm} | ({} if urdf is None else urdf.links)
     what, tables, size = _WHAT[type(plan)], [], []
     if isinstance(plan, Plan):
         for i, name in enumerate(plan.sockets):

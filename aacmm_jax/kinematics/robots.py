@@ -339,12 +339,10 @@ def as_transform(value: Numbers, what: str) -> Transform:
 def mount_rows(base: Transform) -> list[tuple[float, ...]]:
     """theta, d, a, alpha and beta of the three fixed joints that carry a base."""
     turn = (rotation(2, -math.pi / 2) @ base)[:3, :3]  # Rx(alpha) Ry(beta) Rz(theta)
-    level = math.hypot(turn[0, 0], turn[0, 1])
-    beta = math.atan2(turn[0, 2], level)
-    if level > 1e-9:
-        alpha, theta = math.atan2(-turn[1, 2], turn[2, 2]), math.atan2(-turn[0, 1], turn[0, 0])
-    else:  # the axis along y, where alpha and theta turn about the same line
-        alpha, theta = 0.0, math.atan2(turn[1, 0], turn[1, 1])
+    level = math.hypot(turn[0, 0], turn[0, 1])  # 0 with the axis along y, where alpha and theta turn about one line
+    alpha = math.atan2(-turn[1, 2], turn[2, 2]) if level > 1e-9 else 0.0
+    rest = rotation(0, -alpha)[:3, :3] @ turn  # theta from it, as near this line alpha is not exact
+    beta, theta = math.atan2(rest[0, 2], rest[2, 2]), math.atan2(rest[1, 0], rest[1, 1])
     x, y, z = base[:3, 3]
     return [(0.0, z, x, 0.0, 0.0), (math.pi / 2, 0.0, y, alpha, beta), (theta, 0.0, 0.0, 0.0, 0.0)]
 
