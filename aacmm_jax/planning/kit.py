@@ -97,6 +97,8 @@ def plan_kit(arm: Arm, kit: Sequence[KitItem | AbstractSimulated], *, poses: int
         u of 300 mm: at most 0.04 mm
     """
     problem, items = DesignProblem.of(arm, PlanOptions(**options)), _checked(kit)
+    if len(problem.region.chains) > 1:
+        raise InputError("a kit is planned for one chain of a robot; name the chain (chains= or --chain).")
     things = place(problem, items, poses)
     pool = _pool(problem, things)
     least = least_poses(pool)
@@ -223,7 +225,7 @@ def _predictions(
     def loosened(thing: Thing, poses: AbstractObservation) -> AbstractObservation:
         """The same poses, with joints off by some degrees and the tip brought back."""
         seat, q = thing.seat(problem.region), np.asarray(poses.q)
-        starts = q + LOOSE * seat.random.normal(size=q.shape)
+        starts = problem.moved(q, LOOSE)
         moved, good = reached(seat, starts, np.asarray(seat.arm.position(q)))
         good[good] = thing.usable(problem.region, moved[good], 0.0)
         return thing.recorded(problem.region, np.where(good[:, None], moved, q), poses)
