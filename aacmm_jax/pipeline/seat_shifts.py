@@ -37,7 +37,7 @@ class Division(NamedTuple):
     socket: str
     later: str  # name of the socket that its later poses are
     first: int  # the first of these
-    joined: frozenset[int]  # reference lengths that end in the later part
+    joined: frozenset[tuple[str, str]]  # both ends of the reference lengths that end in the later part
 
 
 def with_divided_sockets(
@@ -109,11 +109,11 @@ def _division(record: CalibrationRecord, socket: str, first: int) -> Division:
     capture, arm = record.recording.capture, record.calibrated.arm
     tips = {part.name: np.asarray(arm.position(part.q)) for part in capture.parts}
     parts, joined = (tips[socket][:first].mean(axis=0), tips[socket][first:].mean(axis=0)), set()
-    for number, length in enumerate(capture.lengths):
+    for length in capture.lengths:
         if socket in (length.start, length.end):
             other = tips[length.end if length.start == socket else length.start].mean(axis=0)
             errors = [abs(np.linalg.norm(part - other) - float(length.value)) for part in parts]
-            joined |= {number} if errors[1] < errors[0] else set()
+            joined |= {(length.start, length.end)} if errors[1] < errors[0] else set()
     return Division(socket, f"{socket} (from pose {first + 1})", first, frozenset(joined))
 
 
@@ -130,10 +130,10 @@ def divided(capture: Capture, divisions: Iterable[Division]) -> Capture:
                 if socket in visits:
                     visits |= {socket: visits[socket][:first], later: visits[socket][first:]}
             parts += [(number < seats, one) for one in pair]
-        for number in joined:
-            length = lengths[number]
-            start, end = (later if name == socket else name for name in (length.start, length.end))
-            lengths[number] = ReferenceLength(start, end, length.value, length.u)
+        for number, length in enumerate(lengths):
+            if (length.start, length.end) in joined:
+                start, end = (later if name == socket else name for name in (length.start, length.end))
+                lengths[number] = ReferenceLength(start, end, length.value, length.u)
         sockets = {part.name: part.q for seat, part in parts if seat}
         others = [part for seat, part in parts if not seat]
         capture = Capture(sockets, lengths, others, capture.repeated, capture.sessions, visits)

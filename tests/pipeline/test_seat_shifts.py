@@ -78,7 +78,7 @@ def test_held_out_poses_belong_to_the_part_in_which_they_were_recorded(recorded)
     assert len(whole.sockets["a/0"]) == 20
 
 
-@pytest.mark.parametrize("joined", [frozenset(), frozenset({0})])
+@pytest.mark.parametrize("joined", [frozenset(), frozenset({("a/0", "a/1")})])
 def test_divided_captures_keep_every_pose_and_length(recorded, joined):
     capture = recorded(np.zeros(3)).capture
     visits = {name: np.arange(len(q)) // 5 for name, q in capture.sockets.items()}
