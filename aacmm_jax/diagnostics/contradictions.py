@@ -84,7 +84,7 @@ def removal(removed: Removed) -> Finding:
     if removed.kind == SEAT:
         return Finding(
             "shifted-seat",
-            f"Socket {removed.group}, with its seat or with the artefact {test}.",
+            f"Socket {removed.members[0]} shifted, with its seat or with the artefact: {removed.group} {test}.",
             f"The poses before and after it were used as two sockets: they are {removed.rms_without:.3g} mm RMS from "
             f"their geometry instead of {removed.rms_with:.3g} mm.",
             advice="Fasten the artefact, and check how the tip is seated.",

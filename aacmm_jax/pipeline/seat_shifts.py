@@ -57,7 +57,7 @@ def with_divided_sockets(
             break
         removed = Removed(
             kind=SEAT,
-            group=f"{socket} shifted from pose {first + 1} on by {np.linalg.norm(test.coefficients):.2g} mm",
+            group=f"{socket} from pose {first + 1} on by {np.linalg.norm(test.coefficients):.2g} mm",
             members=(socket, division.later),
             ratio=test.ratio,
             degrees_of_freedom=test.degrees_of_freedom,

@@ -54,7 +54,7 @@ def test_a_socket_is_divided_where_its_seat_shifted(recorded):
     # The sound length, 200 mm, ends where the arm measures it so.
     assert (capture.lengths[0].start, capture.lengths[0].end) == ("a/0", "a/1")
     (finding,) = [found for found in findings_of(record) if found.code == "shifted-seat"]
-    assert f"Socket a/0 shifted from pose {FIRST + 1} on by" in finding.says
+    assert f"a/0 from pose {FIRST + 1} on by" in finding.says
 
 
 @pytest.mark.slow
