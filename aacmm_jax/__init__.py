@@ -9,6 +9,7 @@ The names below are those that most scripts need; everything else is grouped by 
 * `acceptance`, `drift`, `planning`: tests by standards, calibrations compared, which poses to take.
 * `camera`: boards, their corners in images, models of cameras.
 * `files`: every format. `summaries`: sentences and tables. `report`, `plot`, `certificate`, `cli`: what people read.
+* `live`: captures that guide whoever takes them.
 * `core`: arrays, errors, `units`.
 
 A name is imported when it is first asked for; the stub `__init__.pyi` lists them.

@@ -7,6 +7,7 @@ from . import diagnostics as diagnostics
 from . import drift as drift
 from . import files as files
 from . import kinematics as kinematics
+from . import live as live
 from . import model as model
 from . import pipeline as pipeline
 from . import planning as planning

@@ -5,6 +5,8 @@ python benchmarks/cameras.py intrinsics            # against cv2.calibrateCamera
 python benchmarks/cameras.py coverage [trials]     # of 95 % intervals, camera on the arm and fixed
 python benchmarks/cameras.py time                  # 100 poses of 60 corners, everything free
 python benchmarks/cameras.py webcam [arms]         # a 5-joint arm, servo zeros off by 1 deg, links by 1 mm
+
+OpenCV 5 has no methods for hand-eye calibration any more, so hand-eye needs opencv-python-headless<5.
 """
 
 import sys

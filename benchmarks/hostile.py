@@ -5,9 +5,9 @@
 
 damage  Larger damage to the same files, also with a SHA-256 that was lost or computed again.
 flips   Single bits of files of every kind and of a study's blocks.
-texts   Mutated manifests, tables, arms, specifications and certificates.
+texts   Mutated manifests, tables, arms (URDF, MJCF, controllers' files too), specifications and certificates.
 headers Tables whose header contradicts the manifest in unit or order, or is misspelt.
-structure  One name misspelt or repeated: in URDFs, and in half as many TOML files of every kind.
+structure  One name misspelt or repeated: in URDFs, and in half as many MJCF files and TOML files of every kind.
 calls   Hostile arguments of Python functions and of commands.
 kills   A study killed by SIGKILL, resumed, and compared with one that was not, to the bit; threads and processes.
 writes  Files of every kind while they are written: killed, or out of space.

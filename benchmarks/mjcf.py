@@ -2,7 +2,8 @@
 
 Every chain from the last joint that an arm cannot have, or from the world, to each body or site that a chain ends at is
 read, compared in 20 random configurations, perturbed in every parameter by about 1 mm or 1 mrad, exported, and compared
-again as MuJoCo reads the export. Printed are the largest differences by file, mm. The models are not part of the
+again as MuJoCo reads the export; then the chains of several tips as one robot, with joints that follow others, whose
+equalities MuJoCo must find fulfilled. Printed are the largest differences by file, mm. The models are not part of the
 project: packages such as robosuite, dm_control, gymnasium-robotics and metaworld, or MuJoCo Menagerie, have them.
 """
 
@@ -16,8 +17,10 @@ from aacmm_jax import InputError
 from aacmm_jax.files.mjcf import with_includes
 from aacmm_jax.files.mjcf_text import parse_robot
 from aacmm_jax.files.urdf import _joints_before, urdf_chain, urdf_of
-from aacmm_jax.kinematics.arm import by_joint
+from aacmm_jax.files.urdf_robots import read_urdf, urdf_chains
+from aacmm_jax.kinematics.arm import by_joint, parameter_unit, value_of
 from aacmm_jax.kinematics.parameters import ArmSpecification, UrdfSource
+from aacmm_jax.kinematics.robots import chains_of, mount_names
 
 CONFIGURATIONS, FEWEST = 20, 3  # configurations, and joints of a chain that is exported
 _KINDS = ("fixed", "revolute", "continuous", "prismatic")
@@ -54,7 +57,7 @@ def chains(robot):
             if stops or " in line " in f"{joint.name} {joint.child}" or (joint.kind != "fixed" and joint.axis is None):
                 break
             base = joint.parent if ", joint " not in joint.parent else base
-        if base != tip and "(site)" not in tip:
+        if base != tip and "(site)" not in tip and " in line " not in base:
             yield base, tip
 
 
@@ -71,7 +74,7 @@ def compare(path: Path, random: np.random.Generator) -> str:
         return f"refused: {error}"
     count, moved, worst = 0, 0, np.zeros(2)
     for base, tip in chains(robot):
-        source = UrdfSource(text, base, tip)
+        source = UrdfSource(text, base, (tip,))
         try:
             chain = urdf_chain(source)
         except InputError:
@@ -91,15 +94,71 @@ def compare(path: Path, random: np.random.Generator) -> str:
         old = {kind: np.zeros(n) if getattr(arm, kind) is None else getattr(arm, kind) for kind in change}
         calibrated = arm.replace(**{kind: old[kind] + values for kind, values in change.items()})
         exported = urdf_of(calibrated, nominal)
-        beside = path.with_name(f"{path.stem}-exported.xml")  # meshes are looked for beside it
-        beside.write_text(exported.text, encoding="utf-8")
-        try:
-            again = mujoco.MjModel.from_xml_path(str(beside))
-        finally:
-            beside.unlink()
+        again = loaded(path, exported.text)
         difference = chain.base @ np.asarray(calibrated.pose(q)) - poses(again, base, exported.tip, joints, q)
         worst[1] = max(worst[1], np.abs(difference[:, :3, 3]).max())
-    return f"{count:3} chains, up to {moved:2} joints: read {worst[0]:.1e}, exported {worst[1]:.1e}"
+    line = f"{count:3} chains, up to {moved:2} joints: read {worst[0]:.1e}, exported {worst[1]:.1e}"
+    return line + whole(path, model, random)
+
+
+def whole(path: Path, model, random: np.random.Generator) -> str:
+    """What the chains of several tips came to as one robot."""
+    try:
+        nominal = read_urdf(path)
+    except InputError:
+        return ""
+    robot, source = nominal.arm, nominal.urdf
+    if not robot.chains:
+        return ""
+    q = random.uniform(-3, 3, (CONFIGURATIONS, robot.joints)) * by_joint(robot, 1.0, 100.0)
+    read = robot_differences(robot, source, model, source.tips, q)
+    chains = chains_of(robot.replace(mimic=())).values()
+    names = dict.fromkeys(name for chain in chains for name in (*chain.names.values(), *mount_names(chain)))
+    step = {"mm": 1.0, "rad": 1e-3}
+    moved = robot.replace(
+        **{name: float(value_of(robot, name)) + random.normal() * step[parameter_unit(robot, name)] for name in names}
+    )
+    assert urdf_of(robot, nominal).text == source.text, path
+    exported = urdf_of(moved, nominal)
+    written = robot_differences(moved, source, loaded(path, exported.text), exported.tip.split(", "), q)
+    return f"; {len(robot.chains)} chains as a robot with {len(robot.mimic)} followers: {read}, {written}"
+
+
+def robot_differences(robot, source: UrdfSource, model, tips, q: np.ndarray) -> str:
+    """The largest difference of a robot's tips from MuJoCo's, mm, and by how much equalities are not fulfilled."""
+    data, worst, unfulfilled = mujoco.MjData(model), 0.0, 0.0
+    first = urdf_chain(source._replace(tips=source.tips[:1]), alone=False).base
+    joints = q.copy()
+    for joint, followed, factor, offset in robot.mimic:
+        joints[:, joint - 1] = factor * q[:, followed - 1] + offset
+    chains = list(zip(chains_of(robot.replace(mimic=())).values(), urdf_chains(source).values(), tips, strict=True))
+    used = {joint.name for _, urdf, _ in chains for joint in urdf.joints if joint.mimics}
+    for row, values in zip(q, joints, strict=True):
+        data.qpos[:] = model.qpos0
+        for chain, urdf, _ in chains:
+            for joint, number in zip(urdf.joints, chain.joints, strict=True):
+                data.joint(joint.name).qpos = values[number - 1] / (1000 if joint.kind == "prismatic" else 1)
+        mujoco.mj_forward(model, data)
+        for kind, number, distance in zip(data.efc_type, data.efc_id, data.efc_pos, strict=True):
+            equality = kind == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+            equality = equality and model.eq_type[number] == mujoco.mjtEq.mjEQ_JOINT
+            if equality and model.joint(model.eq_obj1id[number]).name in used:
+                unfulfilled = max(unfulfilled, abs(distance))
+        for number, (_, _, tip) in enumerate(chains):
+            expected = np.linalg.inv(frame(model, data, source.base)) @ frame(model, data, tip)
+            found = first @ np.asarray(robot.pose(np.append(row, number)))
+            worst = max(worst, np.abs(found - expected)[:3, 3].max())
+    return f"{worst:.1e}" + (f" (equalities {unfulfilled:.1e})" if robot.mimic else "")
+
+
+def loaded(path: Path, text: str):
+    """A text as MuJoCo reads it beside a file, where it looks for meshes."""
+    beside = path.with_name(f"{path.stem}-exported.xml")
+    beside.write_text(text, encoding="utf-8")
+    try:
+        return mujoco.MjModel.from_xml_path(str(beside))
+    finally:
+        beside.unlink()
 
 
 def main(*places: str) -> None:

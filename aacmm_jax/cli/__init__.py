@@ -23,6 +23,7 @@ _FAMILIES = (
     "plan_commands",
     "target_command",
     "verify_command",
+    "live_command",
 )
 
 

@@ -125,8 +125,9 @@ def arm(
 
 
 def first_frame(specification: Any) -> Any:
-    """The first frame of an arm in the base link of its URDF; None for other arms."""
-    return None if specification.urdf is None else files.urdf_chain(specification.urdf).base
+    """The first frame of an arm, of a robot that of its first chain, in the base link of its URDF; None for others."""
+    urdf = specification.urdf
+    return None if urdf is None else files.urdf_chain(urdf._replace(tips=urdf.tips[:1]), alone=len(urdf.tips) == 1).base
 
 
 def _checked(specification: Any, path: Path, unit: str | None) -> dict[str, Any]:
@@ -208,10 +209,9 @@ def _check_summary(
     from ..files.reading_checks import angles_toml, units_toml
 
     angles = check.couplings or (check.explained and check.best.hypothesis._replace(length=1.0).changes)
-    explanation = check.given if check.couplings else check.best
     return reading_check_summary(check, specification.name, unit=unit, positions=positions) | {
-        "angles": angles_toml(explanation, unit, manifest, check.couplings) if angles else None,
-        "units": units_toml(check.best, positions) if check.explained else None,
+        "angles": angles_toml(check.best, unit, manifest, check.couplings) if angles else None,
+        "units": units_toml(check.best, positions) if check.explained or check.couplings else None,
         "standing": standing_rows(specification.arm, capture, nominal),
         "reading_sets": [],
         "reading_sets_sentence": "",

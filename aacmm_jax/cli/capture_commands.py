@@ -155,8 +155,7 @@ def _with_images(folder: Path, recording: Any, kit: Path | None, arm: str, optic
     if kit is None:
         raise InputError("--images needs a kit with a camera; give --kit FILE.")
     urdf = recording.nominal.urdf if arm.lower().endswith(ROBOT_FILES) else None
-    links = {} if urdf is None else {"base": urdf.base, "tip": list(urdf.tips) if urdf.tips[1:] else urdf.tip}
-    entries = {"arm": arm_for(folder / MANIFEST, arm)} | links
+    entries = {"arm": arm_for(folder / MANIFEST, arm)} | ({} if urdf is None else urdf.links)
     with progress_bar(transient=True) as bar:
         return save_images(folder, recording, kit, entries, Optics(**optics), progress=tracked(bar))
 

@@ -18,7 +18,7 @@ from .app import command, prepare_jax, show_summary, with_spinner
 from .arm_command import first_frame
 from .options import argument, option, output
 
-_ARM_SUFFIXES = ("", ".toml", *ROBOT_FILES, ".yaml", ".yml")
+_ARM_SUFFIXES = ("", ".toml", *ROBOT_FILES, ".yaml", ".yml", ".conf")
 # What reads each kind of file, what makes its summary, and what people see of it.
 _KINDS = {
     "capture": ("load_capture", "calibration.capture_summary", views.capture),

@@ -11,7 +11,7 @@ _COMPARED = 200  # characters of a word: comparing takes their square
 # By extra of pyproject.toml, the package whose presence says whether it is installed.
 _PACKAGES = {
     "plot": "matplotlib", "report": "jinja2", "data": "xarray", "dask": "distributed", "camera": "cv2",
-    "excel": "openpyxl", "ros": "rosbags", "lerobot": "pyarrow",
+    "excel": "openpyxl", "ros": "rosbags", "lerobot": "pyarrow", "live": "starlette",
 }  # fmt: skip
 
 
@@ -36,9 +36,10 @@ class MissingExtra(InputError, ImportError):
     """Something asked for needs an extra that is not installed; the message has the command that installs it."""
 
 
-def require(extra: str, use: str) -> None:
-    """Raise `MissingExtra` where an extra is not installed; ``use`` is what needs it, as the subject of the message."""
-    package = _PACKAGES[extra]
+def require(extra: str, use: str, package: str | None = None) -> None:
+    """Raise `MissingExtra` where an extra, or one ``package`` of it, is not installed; ``use`` is what needs it, as the
+    subject of the message."""
+    package = package or _PACKAGES[extra]
     if importlib.util.find_spec(package) is None:
         # Double quotes are right in every shell, cmd.exe included.
         raise MissingExtra(f'{use} needs {package}; install {package} with: pip install "aacmm_jax[{extra}]"')

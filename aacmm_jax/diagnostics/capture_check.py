@@ -1,6 +1,7 @@
 """Whether the readings of a capture are those of an arm: order, signs, zeros and units, then couplings of joints."""
 
 import itertools
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -9,13 +10,15 @@ from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.observations.measured import MeasuredPoints
 from ..kinematics.arm import Arm
+from ..kinematics.corrections import coefficient_of
 from ..kinematics.robots import chains_of
 from .camera_points import with_points_of_cameras
-from .reading_check import EXPLAINED, NEVER, ReadingCheck, checked_fit, reading_fit
+from .reading_check import EXPLAINED, NEVER, ReadingCheck, checked_fit, possible_units, reading_fit
 from .reading_fit import ReadingFit
 from .reading_search import Hypothesis
 
 _COUPLED = 3  # couplings of joints at most
+_NO_ZERO = 2e-3  # rad: what two zeros that cancel each other may leave
 _LESS = 0.8  # of the residual: what each of several couplings must leave at most
 
 
@@ -26,8 +29,9 @@ def check_capture(arm: Arm, capture: Capture) -> ReadingCheck:
     if arm.chains:
         checks = [check_capture(*part) for part in _by_chain(arm, capture)]
         return next((check for check in checks if not check.explained), checks[0])
-    check = checked_fit(reading_fit(arm, **_evidence_of(arm, capture)))
-    return check if check.explained else check._replace(couplings=search_couplings(arm, capture))
+    fit = reading_fit(arm, **_evidence_of(arm, capture))
+    check = checked_fit(fit)
+    return check if check.explained else _with_couplings(check, fit)
 
 
 def fits_as_recorded(arm: Arm, capture: Capture) -> bool:
@@ -36,8 +40,8 @@ def fits_as_recorded(arm: Arm, capture: Capture) -> bool:
     does."""
     if arm.chains:
         return all(fits_as_recorded(*part) for part in _by_chain(arm, capture))
-    fit, n = reading_fit(arm, **_evidence_of(arm, capture)), arm.joints
-    as_recorded = Hypothesis(tuple(range(n)), (1,) * n, (0.0,) * n)
+    fit = reading_fit(arm, **_evidence_of(arm, capture))
+    as_recorded = _plain(fit)
     residual, with_zeros = fit.explanation(as_recorded).rms_fitted, fit.with_free_zeros(as_recorded)[1]
     possible = float(np.abs(fit.evidence.q).max()) <= NEVER
     return possible and residual <= EXPLAINED * fit.size and residual <= fit.as_good_as(with_zeros)
@@ -92,28 +96,90 @@ def search_couplings(arm: Arm, capture: Capture) -> dict[str, float]:
     three couplings are taken one after the other, each the one that explains most. Raises `InputError` as
     `check_capture` does. Chains of a robot are taken to have none.
     """
-    if arm.chains:
-        return {}
-    fit, n = reading_fit(arm, **_evidence_of(arm, capture)), arm.joints
-    as_recorded = Hypothesis(tuple(range(n)), (1,) * n, (0.0,) * n)
-    enough, turning = EXPLAINED * fit.size, [i for i in range(n) if i + 1 not in arm.prismatic]
-    residual, couplings = fit.with_free_zeros(as_recorded)[1], {}
+    return {} if arm.chains else _couplings(reading_fit(arm, **_evidence_of(arm, capture)))
+
+
+def _couplings(fit: ReadingFit) -> dict[str, float]:
+    enough, couplings = EXPLAINED * fit.size, {}
+    residual = fit.with_free_zeros(_plain(fit))[1]
     if residual <= enough:
         return {}
     for _ in range(_COUPLED):
         candidates = []
-        for source, moved in itertools.combinations(turning, 2):
-            for factor in (-1.0, 1.0):
-                q = fit.evidence.q.copy()
-                q[:, moved] += factor * q[:, source]
-                coupled = ReadingFit(arm, fit.evidence._replace(q=q), fit.size, fit.free_tip)
-                candidates.append((coupled.with_free_zeros(as_recorded)[1], source, moved, factor, coupled))
+        for name, source, moved, factor in _possible(fit):
+            coupled = _coupled(fit, fit.evidence.q, source, moved, factor)
+            candidates.append((coupled.with_free_zeros(_plain(fit))[1], name, factor, coupled))
         candidates.sort(key=lambda candidate: candidate[0])
-        least, source, moved, factor, fit = candidates[0]
-        couplings[f"coupled{source + 1}_{moved + 1}"] = factor
+        least, name, factor, fit = candidates[0]
+        couplings[name] = factor
         if least <= enough:
             return couplings if candidates[1][0] > fit.as_good_as(least) else {}
         if least > _LESS * residual:
             return {}
         residual = least
     return {}
+
+
+def _plain(fit: ReadingFit) -> Hypothesis:
+    n = fit.arm.joints
+    return Hypothesis(tuple(range(n)), (1,) * n, (0.0,) * n)
+
+
+def _possible(fit: ReadingFit) -> Iterator[tuple[str, int, int, float]]:
+    """Couplings of two joints: name, the joint that moves the other one, and that one, from 0, and the factor."""
+    turning = [i for i in range(fit.arm.joints) if i + 1 not in fit.arm.prismatic]
+    for (source, moved), factor in itertools.product(itertools.combinations(turning, 2), (-1.0, 1.0)):
+        yield f"coupled{source + 1}_{moved + 1}", source, moved, factor
+
+
+def _coupled(fit: ReadingFit, q: np.ndarray, source: int, moved: int, factor: float, length: float = 1.0) -> ReadingFit:
+    """With other readings, to one of which another one is added, and with points of another unit."""
+    q = q.copy()
+    q[:, moved] += factor * q[:, source]
+    return ReadingFit(fit.arm, fit.evidence.scaled(1.0, length)._replace(q=q), fit.size, fit.free_tip)
+
+
+def _with_couplings(check: ReadingCheck, fit: ReadingFit) -> ReadingCheck:
+    """The check with couplings that explain the readings, and with the zeros and the other mistake that go with them:
+    a sign, two neighbouring columns that are exchanged, or a unit, for couplings of neighbouring joints."""
+    hypothesis, couplings = _plain(fit), _couplings(fit)
+    if not couplings:
+        found = []
+        neighbours = [one for one in _possible(fit) if one[2] == one[1] + 1]
+        for mistake, (name, source, moved, factor) in itertools.product(_mistakes(fit), neighbours):
+            coupled = _coupled(fit, mistake.readings(fit.evidence.q), source, moved, factor, mistake.length)
+            found.append((coupled.with_free_zeros(_plain(fit))[1], mistake, {name: factor}))
+        least = min(residual for residual, *_ in found)
+        good = [one for one in found if one[0] <= fit.as_good_as(least)]
+        few = min(mistake.changes for _, mistake, _ in good)
+        best = [one for one in good if one[1].changes == few]
+        if least > EXPLAINED * fit.size or len(best) > 1:
+            return check
+        _, hypothesis, couplings = best[0]
+    q, pairs = hypothesis.readings(fit.evidence.q), []
+    for name, factor in couplings.items():
+        term = coefficient_of(name)
+        assert term is not None
+        pairs.append((term.number - 1, term.joint - 1, factor))
+        q[:, term.joint - 1] += factor * q[:, term.number - 1]
+    coupled = ReadingFit(fit.arm, fit.evidence.scaled(1.0, hypothesis.length)._replace(q=q), fit.size, fit.free_tip)
+    explanation = coupled.needed_zeros(_plain(fit), *coupled.with_free_zeros(_plain(fit)))
+    offsets = list(explanation.offsets)
+    for source, moved, factor in reversed(pairs):  # the zeros of the readings, to which the couplings then apply
+        offsets[moved] -= factor * offsets[source]
+    offsets = [offset if abs(offset) > _NO_ZERO else 0.0 for offset in offsets]
+    best = explanation._replace(**hypothesis._replace(offsets=tuple(offsets))._asdict())
+    return check._replace(best=best, couplings=couplings)
+
+
+def _mistakes(fit: ReadingFit) -> Iterator[Hypothesis]:
+    """None, one sign, or one exchange of neighbouring columns, in each unit that is possible."""
+    plain, n = _plain(fit), fit.arm.joints
+    for angle, length in possible_units(fit):
+        within = plain._replace(angle=angle, length=length)
+        yield within
+        yield from (within._replace(signs=tuple(-1 if i == joint else 1 for i in range(n))) for joint in range(n))
+        for joint in range(n - 1):
+            order = list(range(n))
+            order[joint], order[joint + 1] = joint + 1, joint
+            yield within._replace(order=tuple(order))

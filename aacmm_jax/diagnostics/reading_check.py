@@ -64,7 +64,7 @@ class ReadingCheck(NamedTuple):
     rms_with_tip: float | None = None
     free_tip: bool = False  # whether the place of the tip was said to be unknown
     # Of joints that move with others, 1 or -1 by the name of the coefficient: what explains the readings of a capture
-    # where nothing else does.
+    # where nothing else does, together with ``best``.
     couplings: Mapping[str, float] = MappingProxyType({})
 
     @property
@@ -153,7 +153,7 @@ def checked_fit(fit: ReadingFit) -> ReadingCheck:
     arm, evidence, n = fit.arm, fit.evidence, fit.arm.joints
     given = fit.explanation(Hypothesis(tuple(range(n)), (1,) * n, (0.0,) * n))
     candidates, tried = [], 0
-    for angle, length in _units(fit):
+    for angle, length in possible_units(fit):
         rms, hypotheses, count = search(arm, evidence.scaled(angle, length).thinned(), fit.lever)
         tried += count
         groups: list[list[Hypothesis]] = []  # those of equal residual together
@@ -198,7 +198,7 @@ def _with_common_zero(fit: ReadingFit, best: Explanation) -> Explanation:
     return common if as_good else best
 
 
-def _units(fit: ReadingFit) -> Iterator[tuple[float, float]]:
+def possible_units(fit: ReadingFit) -> Iterator[tuple[float, float]]:
     """Factors of readings and of positions that are possible: 1, and others where the numbers look like them."""
     evidence, size = fit.evidence, fit.size
     largest = float(np.abs(evidence.q).max())
@@ -284,9 +284,10 @@ def reading_check_summary(
     improved = f"from {given.rms:.3g} to {best.rms:.3g} mm RMS ({best.rms_fitted:.3g} mm"
     words = explanation_words(best, positions)
     if check.couplings:
-        sentence = (
-            f"The readings fit an arm with coupled joints: {coupling_words(check.couplings)}. 'aacmm calibrate' finds "
-            "these couplings, unless a model is stated."
+        sentence = f"The readings fit an arm with coupled joints: {coupling_words(check.couplings)}. " + (
+            f"In addition, {words}. State both in the manifest."
+            if words
+            else "'aacmm calibrate' finds these couplings, unless a model is stated."
         )
     elif not check.explained:
         sentence = (

@@ -22,14 +22,14 @@ from ..kinematics.parameters import ArmSpecification, single, with_tool
 from ..kinematics.robots import chain_facts
 from ..uncertainty.target_parameters import determined_parameters, only_targets
 from .arm_tables import GEOMETRY, ArmFile, Identification, NoiseTable
-from .controllers import read_ur_kinematics
+from .controllers.universal_robots import read_ur_kinematics
 from .inputs import ROBOT_FILES
 from .outputs import as_path, storable, write_text
 from .toml import read_toml
 from .urdf_robots import read_urdf
 
 _SHIPPED = Path(__file__).with_name("shipped_arms")
-_OTHER_FORMATS = (*ROBOT_FILES, ".yaml", ".yml")
+_OTHER_FORMATS = (*ROBOT_FILES, ".yaml", ".yml", ".conf")
 _SMALLEST, _LARGEST = 5.0, 50_000.0  # mm: no arm's tip is always as near its base, or ever as far
 _FAR = 10_000.0  # mm: no link is as long, but frames on nearly parallel axes may be as far away
 

@@ -18,13 +18,13 @@ from ..core.errors import InputError, naming
 from ..core.rotations import roll_pitch_yaw
 from ..core.text import is_number, quoted
 from .inputs import InputFile
+from .yaml_text import yaml_content
 
 _MATRIX = ("camera_matrix", "cameramatrix", "intrinsic_matrix", "mtx", "k")
 _DISTORTION = ("distortion_coefficients", "dist_coeffs", "distcoeffs", "distortion", "dist", "d")
 _SIZES = (("image_width", "image_height"), ("width", "height"))
 _FISHEYE = ("equidistant", "fisheye")
 _ROS_MODELS = {0: "plumb_bob", 4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial"}  # by number of coefficients
-_LINE = re.compile(r"( *)([\w-]+) *:\s*(?:!!\S+)?\s*(.*)")
 _MOST = 200_000  # characters
 
 
@@ -42,7 +42,7 @@ def read_camera(path: str | os.PathLike) -> StoredCamera:
     with naming(path):
         if len(text) > _MOST:
             raise InputError(f"the file has more than {_MOST:,} characters; give the file of one camera.")
-        entries = _of_json(text) if text.lstrip().startswith("{") else _of_yaml(text)
+        entries = {key.lower(): value for key, value in _content(text).items()}
         matrix = _numbers(entries, _MATRIX, "camera matrix")
         if matrix.size != 9:
             raise InputError(f"the camera matrix has {matrix.size} numbers; give 3 x 3.")
@@ -103,35 +103,14 @@ def _flat(items: Sequence[Any]) -> list[Any]:
     return [x for item in items for x in (_flat(item) if isinstance(item, list) else [item])]
 
 
-def _of_json(text: str) -> dict[str, Any]:
+def _content(text: str) -> dict[str, Any]:
     try:
         content = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"the file is not valid JSON ({error}); correct the file.") from error
-    return {str(key).lower(): value for key, value in content.items()}
-
-
-def _of_yaml(text: str) -> dict[str, Any]:
-    """The part of YAML that these files use: keys with a number, a text, a list, or a table of one more level."""
-    entries: dict[str, Any] = {}
-    table: dict[str, Any] = {}  # of the last key without indent
-    items: list[str] = []  # of a list with a line for each item
-    for line in re.sub(r"\[[^\]]*\]", lambda found: " ".join(found[0].split()), text).splitlines():
-        line = line.split(" #")[0].rstrip()
-        if line.lstrip().startswith("- "):
-            items.append(line.lstrip()[2:].strip())
-        elif match := _LINE.fullmatch(line):
-            indent, key, value = match[1], match[2].lower(), match[3].strip()
-            into = table if indent else entries
-            if value.startswith("["):
-                into[key] = [number.strip() for number in value.strip("[]").split(",") if number.strip()]
-            elif value:
-                into[key] = value.strip("'\"")
-            elif indent:
-                into[key] = items = []
-            else:
-                entries[key] = table = {"data": (items := [])}
-    return entries
+    except (ValueError, RecursionError):  # not JSON, which looks like a table of YAML in braces
+        return yaml_content(text)
+    if not isinstance(content, dict):
+        raise InputError("the file has no names of values; give a camera_info or OpenCV file.")
+    return content
 
 
 def camera_info_yaml(name: str, camera: StoredCamera) -> str:

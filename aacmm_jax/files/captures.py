@@ -108,7 +108,7 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
     if urdf is not None:  # so that an export does not need the file
         lines = urdf.text.splitlines(keepends=True)
         variables = columns("urdf_line", text=(lines, "", "line of the URDF, including its line break"))
-        tables["urdf"] = Table(variables, {"base": urdf.base, "tip": urdf.tip})
+        tables["urdf"] = Table(variables, {"base": urdf.base, "tip": "\n".join(urdf.tips)})
     if recording.true is not None:
         tables["true_arm"] = arm_table(recording.true)
     if recording.as_found is not None:
@@ -162,7 +162,7 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     table = stored.tables.get("urdf")
     if table is not None:
         text = "".join(map(str, table["text"]))
-        source = UrdfSource(text, table.attributes["base"], table.attributes["tip"])
+        source = UrdfSource(text, table.attributes["base"], tuple(table.attributes["tip"].split("\n")))
         with naming(path):
             nominal = nominal._replace(urdf=located(source, nominal.arm))
     return Recording(

@@ -25,8 +25,8 @@ from ..kinematics.robots import together
 from ..kinematics.workspace import Reach
 from ..model.robot_bases import with_found_bases
 from .arms import arm_beside, for_capture, read_arm, usual_noise
+from .controllers.lerobot import angles_by_motors
 from .inputs import InputFile
-from .lerobot_motors import angles_by_motors
 from .manifest_pixels import Cameras, Detecting, Progress, observations_of, without_progress
 from .manifest_readings import Readings, points_of
 from .manifest_rows import Source, name_of, parts
@@ -125,7 +125,7 @@ def _read(
         if angles is not None and angles.calibration is not None:
             angles = angles_by_motors(angles, source.open(angles.calibration), nominal.arm.joints)
         urdf = nominal.urdf
-        names = {} if urdf is None else {tip: joint_names(urdf._replace(tip=tip)) for tip in urdf.tips}
+        names = {} if urdf is None else {tip: joint_names(urdf._replace(tips=(tip,))) for tip in urdf.tips}
         source.rows = readings = Readings(nominal.arm, angles, names)
         sockets, lengths, spheres = _read_recorded(model, source)
         observed: list[tuple[str, Any]] = [(seat.session, seat) for seat in sockets.values() if not seat.target]

@@ -1,5 +1,6 @@
 """Robots in MJCF: the text with what it includes, and with the places of bodies of a calibrated arm."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -70,7 +71,13 @@ def with_includes(text: str, file: Path) -> str:
 
 
 def edited_mjcf(
-    text: str, robot: Robot, path: list[UrdfJoint], frames: list[Transform], link: Transform, tip: Transform
+    text: str,
+    robot: Robot,
+    path: list[UrdfJoint],
+    read: Mapping[str, UrdfJoint],
+    frames: list[Transform],
+    link: Transform,
+    tip: Transform,
 ) -> ExportedUrdf:
     """The text with the places of a calibrated chain; all else stays to the byte.
 
@@ -82,6 +89,7 @@ def edited_mjcf(
         text: The file.
         robot: The robot that it is.
         path: The joints from base to tip, fixed ones included.
+        read: Joints by name as the user's file has them, where ``text`` has another chain of the robot already.
         frames: Of each moving joint its frame in that of the joint before it, at reading 0, mm.
         link: The tip link in the frame of the last moving joint, mm.
         tip: The calibrated tip in this frame, mm.
@@ -99,7 +107,7 @@ def edited_mjcf(
             changed.append(name)
 
     for joint in path:
-        place = joint.place or Placement()
+        place, old = joint.place or Placement(), read.get(joint.name, joint)
         if joint.kind == "fixed":
             if place.body is None and joint.element.name == "body":  # from the last joint of a body to the body
                 continue
@@ -112,20 +120,20 @@ def edited_mjcf(
             if place.body is not None:
                 body, inside = place.body, since
             continue
-        new = turned @ next(remaining) @ place.reference
+        new = turned @ next(remaining) @ (old.place or place).reference
         if place.body is not None:  # the first joint of a body stays where it is in it
             body, anchor = place.body, place.anchor
             moved = inverse(since @ place.outer) @ new @ inverse(anchor)
             stated = inverse(place.outer) @ joint.origin @ place.reference @ inverse(anchor)
             state(body, body.attributes.get("name", joint.name), _changed(moved, stated))
             turned = np.eye(4)
-        elif joint.axis is not None:
+        elif joint.axis is not None and old.axis is not None:
             anchor, turned = shift(anchor[:3, 3] + new[:3, 3]), new - shift(new[:3, 3]) + np.eye(4)
             values, within = {}, inverse(place.around)
-            point, axis = within @ anchor, within[:3, :3] @ turned[:3, :3] @ joint.axis
+            point, axis = within @ anchor, within[:3, :3] @ turned[:3, :3] @ old.axis
             if np.abs(anchor - place.anchor).max() > UNCHANGED[0]:
                 values["pos"] = _row(point[:3, 3] / 1000)
-            if np.abs(turned[:3, :3] @ joint.axis - joint.axis).max() > UNCHANGED[1]:
+            if np.abs(turned[:3, :3] @ old.axis - joint.axis).max() > UNCHANGED[1]:
                 values["axis"] = _row(axis)
             state(joint.element, joint.name, values)
         since = inside = inverse(anchor)
@@ -134,12 +142,12 @@ def edited_mjcf(
         name = unused_name(f"{name}_probe", robot.links)
         values = " ".join(f'{key}="{value}"' for key, value in _values(inverse(inside) @ turned @ tip).items())
         begin, end = body.place
-        tag, after = tags.get(body.place, content[begin:end].decode()), content[end:]
+        tag = tags.get(body.place, content[begin:end].decode())
         site = f"<site name={quoteattr(name)} {values}/>"
         if tag.endswith("/>"):  # a body without elements
             tags[body.place] = f"{tag[:-2].rstrip()}>{site}</body>"
         else:
-            added.append((end, end, after[: len(after) - len(after.lstrip())].decode() + site))
+            added.append((end, end, site))  # in the same line, as elements without a name are called by theirs
         notes = (f"the calibrated tip is the site {quoted(name)}, which was added to the MJCF.",)
     changes = [(begin, end, tag) for (begin, end), tag in tags.items()]
     return ExportedUrdf(replaced(text, [*changes, *added]), name, tuple(changed), notes)

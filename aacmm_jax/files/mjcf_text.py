@@ -30,7 +30,7 @@ _IN_BODY = "joint freejoint site body frame"
 MJCF = Format("MJCF", "mujoco", {
     "mujoco": Names("model", "", "compiler default worldbody equality", others=True),
     "compiler": Names("angle eulerseq coordinate autolimits", others=True),
-    "default": Names("class", "", "default joint site", others=True),
+    "default": Names("class", "", "default joint site equality", others=True),
     "worldbody": Names("", "", "body site frame", others=True),
     "body": Names(f"name childclass {_PLACE}", "inertial", _IN_BODY, others=True),
     "frame": Names(f"name childclass {_PLACE}", "", _IN_BODY, others=True),
@@ -38,7 +38,7 @@ MJCF = Format("MJCF", "mujoco", {
     "freejoint": Names("name", others=True),
     "site": Names(f"name class {_PLACE}", others=True),
     "inertial": Names(f"mass {_PLACE} diaginertia fullinertia", others=True),
-    "equality": Names("", "", "joint", others=True),
+    "equality": Names("active", "", "joint", others=True),
 }, ("body", "joint", "freejoint", "site", "frame"))  # fmt: skip
 
 
@@ -85,7 +85,7 @@ class _Reader:
             raise InputError(
                 f"{settings['eulerseq'].where} has eulerseq = {quoted(self._sequence)}; give three of x, y, z, X, Y, Z."
             )
-        self._defaults: dict[str, dict[str, dict[str, str]]] = {"main": {"joint": {}, "site": {}}}
+        self._defaults: dict[str, dict[str, dict[str, str]]] = {"main": {"joint": {}, "site": {}, "equality": {}}}
         self._bodies = {"world", *_body_names(document.root)}
         self._joints: dict[str, UrdfJoint] = {}
         self._links: dict[str, UrdfLink] = {"world": UrdfLink()}
@@ -96,11 +96,17 @@ class _Reader:
         for element in of_root:
             if element.name == "worldbody":
                 self._read_children(element, "world", np.eye(4), "main")
-        for joint in (joint for element in of_root if element.name == "equality" for joint in element.children):
-            name, other = joint.text("joint1"), joint.attributes.get("joint2")
-            if other and name in self._joints and joint.attributes.get("active") != "false":
-                self._joints[name] = self._joints[name]._replace(mimics=other)
+        for element in of_root:
+            for equality in element.children if element.name == "equality" else ():
+                self._couple(self._with_defaults(equality, "main", "equality"))
         self.robot = tree_of(self._joints, self._links, document)
+
+    def _couple(self, equality: Element) -> None:
+        """A joint that follows another one by an equality."""
+        joint, other = self._joints.get(equality.text("joint1")), equality.attributes.get("joint2")
+        if joint is not None and other and equality.attributes.get("active") != "false":
+            place = (joint.place or Placement())._replace(equality=equality)
+            self._joints[joint.name] = joint._replace(mimics=other, place=place)
 
     def _read_defaults(self, element: Element, name: str) -> None:
         """The values of a class, and of those within it, which begin with its values."""
@@ -112,11 +118,11 @@ class _Reader:
             self._defaults.setdefault(inner, {kind: dict(values) for kind, values in self._defaults[name].items()})
             self._read_defaults(child, inner)
 
-    def _with_defaults(self, element: Element, childclass: str) -> Element:
+    def _with_defaults(self, element: Element, childclass: str, kind: str = "") -> Element:
         name = element.attributes.get("class", childclass)
         if name not in self._defaults:
             raise InputError(f"{element.where} has the class {quoted(name)}, which no <default> defines; add it.")
-        values = self._defaults[name][element.name]
+        values = self._defaults[name][kind or element.name]
         if element.attributes.keys() & set(ORIENTATIONS):  # in place of another way to state it
             values = {key: value for key, value in values.items() if key not in ORIENTATIONS}
         return element._replace(attributes=values | element.attributes)
@@ -166,7 +172,7 @@ class _Reader:
             last = i == len(joints) - 1 and not anchor[:3, 3].any()
             child = name if last else unused_name(f"{name}, joint {i + 1}", self._links)
             self._links.setdefault(child, UrdfLink())
-            place = Placement(element if i == 0 else None, outer, around, anchor, moved)
+            place = Placement(element if i == 0 else None, outer, around, anchor, moved, reference)
             kind = "continuous" if kind == "revolute" and limits is None else kind
             origin = origin @ shift(anchor[:3, 3] - before[:3, 3]) @ inverse(moved)
             self._add(joint, kind, parent, child, origin, place, axis, limits)

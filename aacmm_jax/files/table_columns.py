@@ -259,7 +259,7 @@ def read_poses(
         position = (after, None) if after else None
     else:
         taken = position[0] if position else ()
-        required = recorded or (orientation is None and (near is None or position is None))
+        required = recorded or (orientation is None and position is None)
         picked = reading_columns(table, joints, taken, columns, line="--columns {}", required=required)
     header, linear = header_units(table, picked, arm, unit) if picked else (None, None)
     if linear not in (None, "mm"):

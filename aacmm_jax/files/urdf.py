@@ -212,13 +212,13 @@ def urdf_of(arm: Arm, nominal: ArmSpecification) -> ExportedUrdf:
     if not arm.chains:
         chain = urdf_chain(source)
         return _exported(source, chain, geometry_of(arm), chain.base, (), probes[0])
-    first, plain = urdf_chain(source._replace(tip=source.tips[0]), alone=False).base, arm.replace(mimic=())
+    first, plain = urdf_chain(source._replace(tips=source.tips[:1]), alone=False).base, arm.replace(mimic=())
     tips, changed, notes = [], {}, []
     text = source.text
     for tip, probe in zip(source.tips, probes, strict=True):
-        part, chain = chain_of(plain, tip), urdf_chain(source._replace(tip=tip), alone=False)
+        part, chain = chain_of(plain, tip), urdf_chain(source._replace(tips=(tip,)), alone=False)
         branching = [i for i, joint in enumerate(part.joints) if part.names[f"theta_{i + 1}"] != f"theta_{joint}"]
-        one = source._replace(text=text, tip=tip)
+        one = source._replace(text=text, tips=(tip,))
         exported = _exported(one, chain, geometry_of(part.arm), first @ part.base, branching, probe)
         text, tips, notes = exported.text, [*tips, exported.tip], [*notes, *exported.notes]
         changed |= dict.fromkeys(exported.changed)
@@ -245,7 +245,7 @@ def _exported(
     chain = urdf_chain(source, alone=False)  # as the text has it, which other chains may have changed
     if source.format == "MJCF":
         path = joints_between(chain.robot, source.base, source.tip)
-        return edited_mjcf(source.text, chain.robot, path, frames, link, tip)
+        return edited_mjcf(source.text, chain.robot, path, nominal.robot.joints, frames, link, tip)
     return _edited_urdf(source, chain, frames, link, tip)
 
 

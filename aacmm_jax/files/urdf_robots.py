@@ -2,7 +2,8 @@
 
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
+from itertools import takewhile
 from pathlib import Path
 
 from ..core.arrays import Numbers
@@ -16,7 +17,7 @@ from .inputs import InputFile
 from .mjcf import with_includes
 from .mjcf_text import parse_robot
 from .urdf import UrdfChain, ends_of, joints_between, located, urdf_chain
-from .urdf_text import MOVING, Robot, listed_links, mimic_of
+from .urdf_text import MOVING, Robot, UrdfJoint, listed_links, mimic_of
 
 
 def read_urdf(
@@ -42,7 +43,7 @@ def read_urdf(
             raise InputError(
                 f"the file has several chains, which end at {listed_links(tips)}; choose the tip (tip= or --tip)."
             )
-        source = UrdfSource(text, base, "\n".join(dict.fromkeys(chosen)))
+        source = UrdfSource(text, base, tuple(dict.fromkeys(chosen)))
         arm = urdf_arm(source)
         arm = arm if probe is None else with_tool(arm, probe)
         return ArmSpecification(arm, Path(file).stem, urdf=located(source, arm))
@@ -50,7 +51,7 @@ def read_urdf(
 
 def urdf_chains(source: UrdfSource) -> dict[str, UrdfChain]:
     """The chain to each tip of a robot, by the name of the tip; joints that follow others have a reading here."""
-    tips = {tip: source._replace(tip=tip) for tip in source.tips}
+    tips = {tip: source._replace(tips=(tip,)) for tip in source.tips}
     return {tip: urdf_chain(one, alone=False) for tip, one in tips.items()}
 
 
@@ -76,20 +77,37 @@ def urdf_arm(source: UrdfSource) -> Arm:
 
 def moving_tips(robot: Robot, base: str, tips: list[str]) -> list[str]:
     """One tip for each chain of moving joints that is no beginning of another one, the one after most joints. Chains
-    that differ in their last joint alone are the fingers of a gripper, and end before it."""
-    ends: dict[tuple[str, ...], tuple[int, str]] = {}  # by the moving joints
-    for tip in tips:
-        path = joints_between(robot, base, tip)
+    that differ in their last joint alone are the fingers of a gripper, and end before it; likewise chains before a
+    joint that mimics one that is in none of them."""
+    paths = [joints_between(robot, base, tip) for tip in tips]
+    paths = [path for path in paths if all(joint.kind in ("fixed", *MOVING) for joint in path)]
+    while True:
+        chains = _longest_chains(robot, paths)
+        others = robot.joints.keys() - {name for moving in chains for name in moving}
+
+        def stays(joint: UrdfJoint, others: Set[str] = others) -> bool:
+            return joint.kind == "fixed" or others.isdisjoint((joint.name, joint.mimics))
+
+        shorter = [list(takewhile(stays, path)) for path in paths]
+        if [*map(len, shorter)] == [*map(len, paths)]:
+            return list(chains.values())
+        paths = shorter
+
+
+def _longest_chains(robot: Robot, paths: list[list[UrdfJoint]]) -> dict[tuple[str, ...], str]:
+    """By the moving joints the tip of each chain; as of `moving_tips`."""
+    ends: dict[tuple[str, ...], tuple[int, str]] = {}
+    for path in paths:
         moving = tuple(joint.name for joint in path if joint.kind != "fixed")
-        if all(joint.kind in MOVING for joint in path if joint.kind != "fixed"):
-            ends[moving] = max(ends.get(moving, (0, tip)), (len(path), tip), key=lambda end: end[0])
+        if moving:
+            ends[moving] = max(ends.get(moving, (0, "")), (len(path), path[-1].child), key=lambda end: end[0])
     before = Counter(moving[:-1] for moving in ends)
     fingers = [moving for moving in ends if before[moving[:-1]] > 1]
     for moving in fingers:
         del ends[moving]
         ends.setdefault(moving[:-1], (0, robot.joints[moving[-1]].parent))
     inner = {moving[:count] for moving in ends for count in range(len(moving))}
-    return [tip for moving, (_, tip) in ends.items() if moving not in inner and moving]
+    return {moving: tip for moving, (_, tip) in ends.items() if moving and moving not in inner}
 
 
 def joint_names(source: UrdfSource) -> list[str]:

@@ -52,6 +52,8 @@ class Placement(NamedTuple):
     around: Transform = np.eye(4)  # the frames about the joint in its body
     anchor: Transform = np.eye(4)  # a point on the axis, by a shift in the body
     reference: Transform = np.eye(4)  # the motion from reading 0 to the reading at which the file draws the robot
+    drawn: float = 0.0  # this reading, rad or mm
+    equality: Element | None = None  # that couples the joint to the one it mimics
 
 
 class UrdfJoint(NamedTuple):
@@ -228,17 +230,29 @@ def listed_links(links: Iterable[str]) -> str:
 
 
 def mimic_of(joint: UrdfJoint, robot: Robot) -> tuple[str, float, float]:
-    """The joint that a joint mimics, the factor and the offset, by readings in rad and mm."""
-    element = joint.element.child("mimic")
+    """The joint that a joint mimics, the factor and the offset, by readings in rad and mm.
+
+    The equality of MJCF is a polynomial of the motions from where the file draws the two joints, in rad and m.
+    """
     assert joint.mimics is not None
-    if element is None:  # an equality of MJCF, whose polynomial may be of any order
+    followed = robot.joints[joint.mimics]
+    unit, by = (_METRE if kind == "prismatic" else 1.0 for kind in (joint.kind, followed.kind))
+    if joint.place is None or joint.place.equality is None:
+        element = joint.element.child("mimic") or joint.element
+        factor, offset = (float(element.numbers(*of)[0]) for of in (("multiplier", (1.0,)), ("offset", (0.0,))))
+        return joint.mimics, factor * unit / by, offset * unit
+    element, usual = joint.place.equality, (0.0, 1.0, 0.0, 0.0, 0.0)
+    given = element.attributes.get("polycoef", "").split()  # those that are missing are as usual
+    text = " ".join([*given, *map(str, usual[len(given) :])])
+    offset, factor, *higher = element._replace(attributes={"polycoef": text}).numbers("polycoef", usual)
+    if any(higher):
         raise InputError(
-            f"joint {quoted(joint.name)} mimics {quoted(joint.mimics)}, which is followed only in a URDF; choose links "
-            "without this joint between them."
+            f"{element.where} has polycoef = {quoted(text)}, but joint {quoted(joint.name)} can follow another joint "
+            "only by an offset and a factor; choose links without this joint between them."
         )
-    factor, offset = (float(element.numbers(*of)[0]) for of in (("multiplier", (1.0,)), ("offset", (0.0,))))
-    unit, followed = (1000.0 if kind == "prismatic" else 1.0 for kind in (joint.kind, robot.joints[joint.mimics].kind))
-    return joint.mimics, factor * unit / followed, offset * unit
+    factor *= unit / by
+    drawn = 0.0 if followed.place is None else followed.place.drawn
+    return joint.mimics, float(factor), float(offset * unit + joint.place.drawn - factor * drawn)
 
 
 def edited(text: str, origins: Mapping[str, Mapping[str, str]], robot: Robot, added: str = "") -> str:

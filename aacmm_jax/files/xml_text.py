@@ -248,9 +248,15 @@ def _is_read(names: Mapping[str, Names], name: str, parent: Element, line: int) 
     return False
 
 
+def _alike(name: str, other: str) -> bool:
+    """Whether one may be the other misspelt; of names of three letters one wrong letter is enough."""
+    one_wrong = len(name) == len(other) and sum(map(str.__ne__, name, other)) == 1
+    return one_wrong or sorted(name) == sorted(other) or difflib.SequenceMatcher(None, name, other).ratio() >= _ALIKE
+
+
 def _check_name(known: Mapping[str, Names], element: Element, what: str, name: str, names: list[str]) -> None:
     """Refuse the name of an attribute or element in an element that is misspelt, or none of ``names``."""
-    if not known[element.name].others or difflib.get_close_matches(name.casefold(), names, n=1, cutoff=_ALIKE):
+    if not known[element.name].others or any(_alike(name.casefold(), other) for other in names):
         shape = "<{}>" if what == "element" else "{}"
         meant = nearest(shape.format(name.casefold()), map(shape.format, names)) if names else "; remove it."
         shown = f"<{quoted(name)[1:-1]}>" if what == "element" else quoted(name)

@@ -303,15 +303,20 @@ class UrdfSource(NamedTuple):
 
     text: str  # the whole file, and what it includes
     base: str  # name of the link that does not move
-    tip: str  # name of the link at the end of the chain; of a robot those of all chains, one a line
+    tips: tuple[str, ...]  # names of the links at the ends of the chains: one of an arm, several of a robot
     first: tuple[tuple[float, ...], ...] = ()  # the arm's first frame in the base link, 4 x 4, mm
     link: tuple[float, ...] = ()  # origin of the tip link in the last frame, mm; its axes are those of that frame
     follows: bool = False  # whether an export moves the tip link to the calibrated probe
 
     @property
-    def tips(self) -> tuple[str, ...]:
-        """Names of the links at the ends of the chains."""
-        return tuple(self.tip.split("\n"))
+    def tip(self) -> str:
+        """The link at the end of the chain, of a robot of the first."""
+        return self.tips[0]
+
+    @property
+    def links(self) -> dict[str, str | list[str]]:
+        """``base`` and ``tip`` as files state them."""
+        return {"base": self.base, "tip": list(self.tips) if self.tips[1:] else self.tip}
 
     @property
     def format(self) -> str:

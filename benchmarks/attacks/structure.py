@@ -1,4 +1,4 @@
-"""One name of a file is misspelt or repeated: an element or attribute of a URDF, a key or table of a TOML file.
+"""One name of a file is misspelt or repeated: an element or attribute of a URDF or MJCF, a key or table of a TOML file.
 
 A result that differs is silent unless a sentence, of the refusal or of a warning, says so. Values are data and stay.
 """
@@ -9,7 +9,7 @@ import random
 import re
 import shutil
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from .outcomes import Attempt, exact, read_again
 ROOT = Path(__file__).resolve().parents[2]
 _SEVERAL = ("visual", "collision")
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
+_KINDS = ("element", "attribute", "attribute twice", "element twice")
 _IN_A_JOINT = 3  # so much more often is a name in a joint or a link's masses and shapes taken, than another one
 KIT = """[[socket]]
 name = "cone"
@@ -80,8 +81,8 @@ def misspelt(name: str, choose: random.Random) -> str:
             return other
 
 
-def edited_urdf(text: str, choose: random.Random) -> tuple[str, tuple[str, ...]]:
-    """A URDF with one name misspelt or repeated, and the names that a sentence may say."""
+def edited_robot(text: str, choose: random.Random, kinds: Sequence[str] = _KINDS) -> tuple[str, tuple[str, ...]]:
+    """A URDF or MJCF with one name misspelt or repeated, and the names that a sentence may say."""
     root = ET.fromstring(text)
     parents = {child: parent for parent in root.iter() for child in parent}
     pool = [element for element in root.iter() if element is not root and "}" not in element.tag]
@@ -92,7 +93,7 @@ def edited_urdf(text: str, choose: random.Random) -> tuple[str, tuple[str, ...]]
             element for part in (*link.iter("inertial"), *link.iter("collision")) for element in part
         ]
     element = choose.choice(pool)
-    kind = choose.choice(["element", "attribute", "element twice", "attribute twice"])
+    kind = choose.choice(kinds)
     if kind.startswith("attribute") and element.attrib:
         name = choose.choice(list(element.attrib))
         wrong = misspelt(name, choose) if kind == "attribute" else name.upper()
@@ -181,16 +182,24 @@ def _tomls(folder: Path) -> dict[str, Callable[[], object]]:
 
 
 def attack(folder: Path, seed: int, count: int) -> Iterator[Attempt]:
-    """So many URDFs, and half as many TOML files, each with one name misspelt or repeated."""
+    """So many URDFs, and half as many MJCF and TOML files, each with one name misspelt or repeated."""
     choose = random.Random(seed)
     files, path = urdf_files(), folder / "robot.urdf"
     for _ in range(count):
         source = choose.choice(files)
         expected = exact(urdf_content(source))
-        text, names = edited_urdf(source.read_text(encoding="utf-8"), choose)
+        text, names = edited_robot(source.read_text(encoding="utf-8"), choose)
         path.write_text(text, encoding="utf-8")
         outcome, message = read_again(lambda: urdf_content(path), expected, names=names)
         yield Attempt("urdf", outcome, f"{source.name}, {' -> '.join(names)}: {message}")
+    mjcf, path = ET.tostring(ET.fromstring(texts.MJCF), encoding="unicode"), folder / "robot.xml"
+    path.write_text(mjcf, encoding="utf-8")
+    expected = exact(aj.load_arm(path))
+    for _ in range(count // 2):
+        text, names = edited_robot(mjcf, choose, _KINDS[:-1])  # MJCF may have any element twice
+        path.write_text(text, encoding="utf-8")
+        outcome, message = read_again(lambda: aj.load_arm(path), expected, names=names)
+        yield Attempt("mjcf", outcome, f"{' -> '.join(names)}: {message}")
     readers = _tomls(folder)
     results = {name: exact(read()) for name, read in readers.items()}
     for _ in range(count // 2):

@@ -134,6 +134,38 @@ URDF = """<robot name="two">
   <link name="tip"/>
 </robot>
 """
+MJCF = """<mujoco model="two arms">
+  <compiler angle="degree" eulerseq="zyx"/>
+  <default><joint axis="0 1 0" range="-120 120"/><default class="up"><joint axis="0 0 2"/></default></default>
+  <worldbody>
+    <body name="trunk" pos="0 0 0.3">
+      <joint name="turn" class="up"/>
+      <body name="left" pos="0.1 0.2 0.1" euler="80 0 10">
+        <joint name="one"/><joint name="two" pos="0 0.02 0.05" axis="1 0.1 0" ref="15"/>
+        <site name="left_tool" pos="0 0 0.25" xyaxes="0 1 0.1 -1 0 0"/>
+        <body name="left_hand" pos="0.3 0 0.1" quat="2 0 0 1"><joint name="three" type="slide" range="-0.1 0.3"/></body>
+      </body>
+      <frame pos="0.1 -0.2 0.1" axisangle="1 0 0 -80">
+        <body name="right" zaxis="0.1 0 1"><joint name="four"/>
+          <body name="right_hand" pos="0.3 0 0.125"><joint name="five"/></body></body>
+      </frame>
+    </body>
+  </worldbody>
+  <equality><joint joint1="three" joint2="one" polycoef="0.01 -0.25"/></equality>
+</mujoco>
+"""
+UR_NOMINAL = """[DH]
+a = [0.0, -0.425, -0.3922, 0.0, 0.0, 0.0]
+d = [0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996]
+alpha = [1.570796327, 0, 0, 1.570796327, -1.570796327, 0]
+"""
+UR_CALIBRATION = """[mounting]
+delta_theta = [0.00000125, -0.0025, 0.00125, 0.00125, 0.0025, 0.0]
+delta_a = [0.00025, 0.00125, 0.0005, 0.00025, 0.0005, 0]
+delta_d = [0.00025, 0.0005, -0.00025, 0.00075, 0.0005, 0.0005]
+delta_alpha = [0.0005, 0.00025, 0.0005, 0.0005, 0.0005, 0]
+calibration_status = 2 # 2 == Linearised
+"""
 STUDY = """name = "Study"
 arm = "arm.toml"
 trials = 10
@@ -197,6 +229,9 @@ def originals(folder: Path) -> dict[str, Callable[[], object]]:
         ("s.toml", STUDY),
         ("l.toml", ABOUT),
         ("r.urdf", URDF),
+        ("r.xml", MJCF),
+        ("urcontrol.conf", UR_NOMINAL),
+        ("calibration.conf", UR_CALIBRATION),
     ):
         (folder / name).write_text(text)
     (folder / "kinematics.yaml").write_text(aj.files.ur_kinematics_yaml(sample.arm.arm))
@@ -222,6 +257,9 @@ def originals(folder: Path) -> dict[str, Callable[[], object]]:
         "o.csv": observed,
         "arm.toml": lambda: aj.files.load_specification(folder / "arm.toml"),
         "r.urdf": lambda: aj.load_arm(folder / "r.urdf"),
+        "r.xml": lambda: aj.load_arm(folder / "r.xml"),
+        "urcontrol.conf": lambda: aj.load_arm(folder / "urcontrol.conf"),
+        "calibration.conf": lambda: aj.load_arm(folder / "calibration.conf"),
         "kinematics.yaml": lambda: aj.load_arm(folder / "kinematics.yaml"),
         "p.toml": points_file,
         "points.csv": points_file,
@@ -338,6 +376,7 @@ CORRUPTIONS: dict[str, Callable[[str, random.Random], str]] = {
 NAMES = {
     ".toml": r"(?m)(?:^|(?<=[{,])) *([A-Za-z_][\w-]*)(?= *=[^=])|^\[+([\w.]+)\]+",
     ".yaml": r"(?m)^ *([A-Za-z_]\w*):",
+    ".conf": r"(?m)^ *([A-Za-z_]\w*) *=|^\[(\w+)\]",
     ".urdf": r"</?([A-Za-z_][\w:]*)|\s([A-Za-z_]\w*)\s*=",
     ".xml": r"</?([A-Za-z_][\w:]*)|\s([A-Za-z_]\w*)\s*=",
     ".csv": r"\A[^\n]*",

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
-from aacmm_jax.cli.controller_commands import in_first_frame
+from aacmm_jax.cli.commanded import in_first_frame
 from aacmm_jax.kinematics.inverse_kinematics import corrected_readings
 from aacmm_jax.summaries.correction import correction_summary
 
@@ -203,6 +203,7 @@ def test_poses_of_a_urdf_are_in_its_base_link():
         ([f"q_{i}_deg" for i in range(1, 7)], [0] * 6, ("--unit", "rad"), "states deg"),
         ([f"q_{i}_deg" for i in range(1, 7)], [0] * 6, ("--near", "0,0,0,0,0,0"), "or --near"),
         (["x", "y", "z", "qw", "qx", "qy", "qz"], [1, 2, 3, 1, 0, 0, 0], ("--unit", "deg"), "--near"),
+        (["x", "y", "z"], [1, 2, 3], ("--unit", "deg"), "give either columns q_1 to q_6 or --near"),
         (
             ["x", "y", "z", "qw", "qx", "qy", "qz"],
             [1, 2, 3, 1, 0, 0, 1],

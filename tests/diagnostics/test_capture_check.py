@@ -62,6 +62,34 @@ def test_a_check_names_them(monkeypatch):
     assert "joint 3 moves by its reading minus that of joint 2 (coupled2_3 = -1)" in said
 
 
+# What a table has in place of the readings, and what the check finds: order, signs, zeros in deg, factor of the unit.
+WITH_COUPLING = {
+    "zeros": (lambda q: q - [0, 0, 0.65, 0.4, 0, 0], None, None, [0, 0, 37.2, 22.9, 0, 0], 1),
+    "sign": (lambda q: q * [1, 1, -1, 1, 1, 1], None, (1, 1, -1, 1, 1, 1), [0] * 6, 1),
+    "order": (lambda q: q[:, [0, 1, 2, 3, 5, 4]], (0, 1, 2, 3, 5, 4), None, [0] * 6, 1),
+    "unit": (np.degrees, None, None, [0] * 6, np.pi / 180),
+    "sign and zero": (lambda q: (q - [0, 0.5, 0, 0, 0, 0]) * [1, 1, 1, -1, 1, 1], None, (1, 1, 1, -1, 1, 1),
+                      [0, 28.6, 0, 0, 0, 0], 1),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mistake", WITH_COUPLING)
+def test_a_coupling_beside_other_mistakes(monkeypatch, mistake):
+    monkeypatch.setattr(reading_search, "_MOST", 2_000)
+    monkeypatch.setattr(reading_check, "_REFITTED", 2)
+    change, order, signs, zeros, factor = WITH_COUPLING[mistake]
+    nominal, capture = recorded(ELBOW, "sockets")
+    check = check_capture(nominal, aj.Capture({name: change(np.asarray(q)) for name, q in capture.sockets.items()}))
+    assert check.couplings == ELBOW
+    assert (check.best.order, check.best.signs) == (order or (0, 1, 2, 3, 4, 5), signs or (1,) * 6)
+    np.testing.assert_allclose(np.degrees(check.best.offsets), zeros, atol=1)
+    assert check.best.angle == pytest.approx(factor)
+    sentence = reading_check_summary(check, "ur10e")["sentence"]
+    assert "coupled2_3 = -1" in sentence
+    assert "In addition, " in sentence
+
+
 @pytest.mark.parametrize("model", [None, "coupled=2-3", pytest.param("dh", marks=pytest.mark.slow)])
 def test_a_calibration_sets_them_unless_a_model_without_them_is_stated(model):
     """Its mean is 1 or -1, so that the prior of small couplings does not pull to 0, and what it really is is found."""

@@ -50,6 +50,10 @@ d:
 k: [600.5, 0, 319.5, 0, 601.25, 239.5, 0, 0, 1]
 binning_x: 0
 """
+FLOW = """{image_width: 640, image_height: 480, camera_name: webcam,
+  camera_matrix: {rows: 3, cols: 3, data: [600.5, 0, 319.5, 0, 601.25, 239.5, 0, 0, 1]},
+  distortion_model: plumb_bob, distortion_coefficients: {rows: 1, cols: 5, data: [-1.0e-1, 0.02, 0, 0, 0]}}
+"""
 
 
 @pytest.mark.parametrize(
@@ -71,6 +75,8 @@ def test_camera_info_comes_back(tmp_path, model, distortion):
     ("name", "text", "model", "distortion"),
     [
         ("camera.yml", OPENCV, "pinhole", [-0.1, 0.02, 0, 0, 0]),
+        ("flow.yaml", "---\n" + FLOW, "pinhole", [-0.1, 0.02, 0, 0, 0]),
+        ("flow.yaml", FLOW, "pinhole", [-0.1, 0.02, 0, 0, 0]),
         ("message.yaml", MESSAGE, "fisheye", [0.1, 0.2, 0.0, -0.1]),
         ("camera.json", json.dumps({"image_width": 640, "image_height": 480, "dist": [[0.1, 0, 0, 0]],
                                     "mtx": np.reshape(MATRIX, (3, 3)).tolist()}), "pinhole", [0.1, 0, 0, 0]),

@@ -8,7 +8,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.files.arm_tables import with_model
 from aacmm_jax.files.arms import load_specification, save_arm, specification_toml
-from aacmm_jax.files.controllers import python_program
+from aacmm_jax.files.controllers.tables import python_program
 from aacmm_jax.kinematics import with_corrections
 from aacmm_jax.kinematics.arm import correction_names
 from tests.prismatic_arms import SCARA

@@ -13,12 +13,19 @@ from scipy.spatial.transform import Rotation
 import aacmm_jax as aj
 from aacmm_jax.files.mjcf_text import parse_robot
 from aacmm_jax.files.urdf import urdf_chain, urdf_of
-from aacmm_jax.kinematics.arm import by_joint
+from aacmm_jax.files.urdf_robots import read_urdf, urdf_chains
+from aacmm_jax.kinematics.arm import by_joint, parameter_unit, value_of
 from aacmm_jax.kinematics.parameters import ArmSpecification, UrdfSource
+from aacmm_jax.kinematics.robots import chains_of, mount_names
 
 CONFIGURATIONS = 1000
 # Files that the independent readers cannot read (a robot without a name).
 UNREADABLE = ("ur3.urdf",)
+# Tips of files in which other chains have joints without limits, or joints that mimic one that does not exist.
+TIPS = {
+    "centauro": [*(f"ball{i}_tip" for i in (1, 2)), *(f"ankle2_{i}" for i in range(1, 5))],
+    "alex_psyonic_hands": ["Head", "LeftGripperYawLink", "RightGripperYawLink"],
+}
 
 
 def robots() -> list[Path]:
@@ -131,7 +138,7 @@ def test_every_chain_in_and_out(tmp_path, every):
         tips = {tip: (base, moving) for tip, (base, moving) in tips.items() if moving}
         differences, errors = [Differences() for _ in range(4)], []
         for tip, (base, moving) in sorted(tips.items(), key=lambda item: -item[1][1]):
-            source = UrdfSource(text, base, tip)
+            source = UrdfSource(text, base, (tip,))
             chain = urdf_chain(source)
             parts = np.concatenate([*chain.origins, chain.tip]).tobytes(), *(j.axis.tobytes() for j in chain.joints)
             if parts in seen:  # of a variant of the same robot
@@ -156,7 +163,7 @@ def test_every_chain_in_and_out(tmp_path, every):
                 errors.append(error)
             exported = urdf_of(arm, nominal)
             (tmp_path / "out.urdf").write_text(exported.text, encoding="utf-8")
-            again = urdf_chain(UrdfSource(exported.text, base, exported.tip))
+            again = urdf_chain(UrdfSource(exported.text, base, (exported.tip,)))
             q = q[:100]
             expected = chain.base @ np.asarray(arm.pose(q))
             Differences().check(again.base @ np.asarray(again.arm.pose(q)), expected)
@@ -188,6 +195,62 @@ def calibrated(arm: aj.Arm) -> tuple[aj.Arm, tuple[float, float]]:
     errors = [np.asarray(one.position(q[2:])) - np.asarray(true.position(q[2:])) for one in (nominal, result.arm)]
     before, after = (float(np.sqrt(np.mean(np.sum(error**2, axis=1)))) for error in errors)
     return result.arm, (before, after)
+
+
+def whole_robots() -> dict[str, ArmSpecification]:
+    """The robots of several chains, by their name; those whose text is that of another one once."""
+    found: dict[str, ArmSpecification] = {}
+    for path in robots():
+        try:
+            robot = read_urdf(path, tip=TIPS.get(path.stem))
+        except aj.InputError:
+            continue
+        if robot.arm.chains and robot.urdf.text not in {one.urdf.text for one in found.values()}:
+            found[f"{path.parent.parent.name}/{path.stem}"] = robot
+    return found
+
+
+def from_pinocchio(robot: aj.Arm, source: UrdfSource, text: str, tips: list[str], q: np.ndarray) -> Differences:
+    """The largest differences of the poses of a robot's tips from those that Pinocchio reads in a text."""
+    import pinocchio
+
+    model, differences = pinocchio.buildModelFromXML(text), Differences()
+    first = urdf_chain(source._replace(tips=source.tips[:1]), alone=False).base
+    all_joints = q.copy()  # with those that follow others
+    for joint, followed, factor, offset in robot.mimic:
+        all_joints[:, joint - 1] = factor * q[:, followed - 1] + offset
+    chains = zip(chains_of(robot.replace(mimic=())).values(), urdf_chains(source).values(), tips, strict=True)
+    for number, (chain, urdf, tip) in enumerate(chains):
+        names, own = [joint.name for joint in urdf.joints], np.array(chain.joints) - 1
+        found = first @ np.asarray(robot.pose(np.column_stack([q, np.full(len(q), number)])))
+        differences.check(found, by_pinocchio(model, source.base, tip, names, all_joints[:, own]))
+    return differences
+
+
+@pytest.mark.parametrize(
+    "every", [pytest.param(8, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.exhaustive)]
+)
+def test_whole_robots_in_and_out(every):
+    """All chains of a robot at once: read, every parameter changed by about 1 mm or 1 mrad, and exported."""
+    random, found = np.random.default_rng(0), whole_robots()
+    assert len(found) >= 40
+    names = {name.split("/")[1] for name in found}
+    assert {"talos_full_v2", "tiago_dual", "tiago_pro", "g1_29dof_with_hand_rev_1_0", "baxter", "pr2"} <= names
+    print("\nlargest differences from Pinocchio, mm and rad: as read; after an export")
+    for name, nominal in list(found.items())[::every]:
+        source, robot = nominal.urdf, nominal.arm
+        assert urdf_of(robot, nominal).text == source.text
+        q = random.uniform(-np.pi, np.pi, (20, robot.joints)) * by_joint(robot, 1.0, 100.0)
+        read = from_pinocchio(robot, source, source.text, list(source.tips), q)
+        chains = chains_of(robot.replace(mimic=())).values()
+        names = dict.fromkeys(name for chain in chains for name in (*chain.names.values(), *mount_names(chain)))
+        moved = robot.replace(**{
+            name: float(value_of(robot, name)) + random.normal() * {"mm": 1.0, "rad": 1e-3}[parameter_unit(robot, name)]
+            for name in names
+        })  # fmt: skip
+        exported = urdf_of(moved, nominal)
+        written = from_pinocchio(moved, source, exported.text, exported.tip.split(", "), q)
+        print(f"{name:50} {len(robot.chains):2} chains, {robot.joints:3} joints ", read, written, flush=True)
 
 
 def perturbed(arm: aj.Arm, random: np.random.Generator) -> aj.Arm:

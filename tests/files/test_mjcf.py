@@ -109,7 +109,7 @@ def assert_same(found, expected):
 
 
 def read(text: str, tip: str, base: str = "world") -> ArmSpecification:
-    source = UrdfSource(text, base, tip)
+    source = UrdfSource(text, base, (tip,))
     return ArmSpecification(urdf_chain(source).arm, urdf=source)
 
 
@@ -218,11 +218,11 @@ def test_files_and_defaults(tmp_path):
     found = aj.files.save_urdf(nominal.arm, tmp_path / "out.xml", nominal=nominal)
     assert (tmp_path / "out.xml").read_bytes() == (tmp_path / "robot.xml").read_bytes()
     assert (found.changed, found.notes, found.tip) == ((), (), "flange")
-    assert UrdfSource("<!-- <mujoco> --><robot/>", "", "").format == "URDF"
+    assert UrdfSource("<!-- <mujoco> --><robot/>", "", ()).format == "URDF"
 
 
 def test_masses_of_what_each_joint_carries():
-    chain = urdf_chain(UrdfSource(TEXT, "base", "tool"))
+    chain = urdf_chain(UrdfSource(TEXT, "base", ("tool",)))
     masses = aj.files.link_masses(chain)
     np.testing.assert_allclose(masses.mass, [2, 0, 0, 0, 0, 0])
     frame = dh_frames(geometry_of(chain.arm), chain.base)[1]
@@ -298,8 +298,14 @@ REFUSED = {
     "root": ("mujoco", "mujocu", "tool", ["root element is <mujocu>", "MJCF has the root element <mujoco>"]),
     "entities": ("<mujoco", '<!DOCTYPE m [<!ENTITY a "aa">]><mujoco', "tool", ["declares a document type"]),
     "deep": ("<light", f"{100 * '<a>'}{100 * '</a>'}<light", "tool", ["too deeply"]),
-    "mimic": ("<actuator>", '<equality><joint joint1="joint_5" joint2="joint_4"/></equality><actuator>', "tool", [
-        "'joint_5' mimics 'joint_4'"
+    "polynomial": (
+        "<actuator>",
+        '<equality><joint joint1="joint_5" joint2="joint_3" polycoef="0 1 0.5"/></equality><actuator>',
+        "tool",
+        ["polycoef = '0 1 0.5 0.0 0.0'", "joint 'joint_5' can follow another joint only by an offset and a factor"],
+    ),
+    "mimic": ("<actuator>", '<equality><joint joint1="joint_5" joint2="other"/></equality><actuator>', "tool", [
+        "'joint_5' mimics 'other', which is not a joint of the same chain"
     ]),
 }  # fmt: skip
 
@@ -318,3 +324,58 @@ def test_orientations_are_those_of_the_reference():
     robot = parse_robot(TEXT)
     expected = Rotation.from_euler("Y", 15, degrees=True) * Rotation.from_euler("ZX", [-30, 5], degrees=True)
     np.testing.assert_allclose(robot.joints["joint_5"].origin[:3, :3], expected.as_matrix(), atol=1e-15)
+
+
+# Two arms of a hinge and a slide on a turning trunk, one of which has a joint that follows another.
+COUPLED = """<mujoco>
+  <compiler angle="degree"/>
+  <default><equality active="true"/></default>
+  <worldbody>
+    <body name="trunk" pos="0 0 0.3"><joint name="turn" range="-170 170"/><geom size="0.1"/>
+      <body name="left" pos="0.1 0.2 0.1" euler="80 0 10"><joint name="left_1"/><geom size="0.1"/>
+        <body name="left_hand" pos="0.3 0 0.1"><joint name="left_2" axis="1 0 0" range="-90 90"/><geom size="0.1"/>
+          <body name="left_tool" pos="0 0.1 0"><geom size="0.1"/></body></body></body>
+      <body name="right" pos="0.1 -0.2 0.1" euler="-80 0 0"><joint name="right_1" ref="20"/><geom size="0.1"/>
+        <body name="right_hand" pos="0.3 0 0.1" euler="0 20 0"><geom size="0.1"/>
+          <joint name="right_2" axis="1 0.2 0" type="slide" range="-0.3 0.3" ref="0.05"/>
+          <joint name="right_3" pos="0.02 0 0.05" axis="0.1 1 0"/>
+          <body name="right_tool" pos="0 0.1 0.2"><geom size="0.1"/></body></body></body>
+    </body>
+  </worldbody>
+  <equality><joint name="gear" joint1="right_2" joint2="right_1" polycoef="0.01 -0.2 0"/>
+    <joint joint1="right_3" joint2="left_1" polycoef="0.1 2" active="false"/></equality>
+</mujoco>"""
+
+
+def test_several_tips_and_an_equality_are_a_robot(tmp_path):
+    """MuJoCo finds the equality fulfilled, and the tips where the robot has them, as read and after an export."""
+    mujoco = pytest.importorskip("mujoco")
+    (tmp_path / "robot.xml").write_text(COUPLED)
+    nominal = aj.files.load_specification(tmp_path / "robot.xml")
+    robot = nominal.arm
+    assert [name for name, _ in robot.chains] == ["left_tool", "right_tool"]
+    ((follower, followed, factor, offset),) = robot.mimic
+    assert aj.files.urdf_of(robot, nominal).text == COUPLED
+    calibrated = aj.perturbed_arm(aj.Parameters.free_of(robot), length=3.0, angle=0.01, seed=1)
+    exported = aj.files.urdf_of(calibrated, nominal)
+    assert exported.text.count("<equality>") == 1
+    assert {"right", "right_3"} <= set(exported.changed)
+    q = np.random.default_rng(0).uniform(-1, 1, (8, robot.joints))
+    numbers = {"turn": 1, "left_1": 3, "left_2": 4, "right_1": 6, "right_2": follower, "right_3": 8}
+    assert (followed, factor, offset) == (6, -200.0, pytest.approx(10 + 50 + 200 * np.radians(20)))
+    first = urdf_chain(nominal.urdf._replace(tips=("left_tool",)), alone=False).base
+    for arm, text, tips in ((robot, COUPLED, nominal.urdf.tips), (calibrated, exported.text, exported.tip.split(", "))):
+        model = mujoco.MjModel.from_xml_string(text)
+        data = mujoco.MjData(model)
+        for row in q:
+            for name, joint in numbers.items():
+                data.joint(name).qpos = row[joint - 1]
+            data.joint("right_2").qpos = (factor * row[followed - 1] + offset) / 1000
+            mujoco.mj_forward(model, data)
+            equality = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+            np.testing.assert_allclose(data.efc_pos[equality], 0, atol=1e-15)
+            assert np.sum(equality) == 1
+            for number, tip in enumerate(tips):
+                pose = first @ np.asarray(arm.pose(np.append(row, number)))
+                place = data.body(tip) if tip in nominal.urdf.tips else data.site(tip)
+                np.testing.assert_allclose(pose[:3, 3], 1000 * place.xpos, rtol=0, atol=1e-9)

@@ -8,7 +8,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.data.observations.held import Socket
 from aacmm_jax.data.recording import Recording
-from aacmm_jax.files import controllers, plans
+from aacmm_jax.files import plans
 from aacmm_jax.files.captures import load_capture, save_capture
 from aacmm_jax.files.manifest import read_manifest
 from aacmm_jax.files.table_columns import corrected_csv, read_poses
@@ -139,11 +139,11 @@ def test_for_controllers():
     """Zero offsets in mm of slides, found exactly where nothing else differs; tables and programs say which slide."""
     calibrated = LINEAR_AXIS.replace(d_1=0.3, theta_2=LINEAR_AXIS.theta[1] + 0.001, theta_4=-0.002)
     readings = np.random.default_rng(1).uniform(*np.array(LINEAR_AXIS.limits).T, (30, 7))
-    found = controllers.zero_offsets(LINEAR_AXIS, calibrated, readings)
+    found = aj.files.zero_offsets(LINEAR_AXIS, calibrated, readings)
     np.testing.assert_allclose(found.offsets[:4], [0.3, 0.001, 0, -0.002], atol=1e-8)
     assert found.units == ("mm", *["rad"] * 6)
-    assert controllers.zero_offsets_csv(found).splitlines()[3] == "joint,offset_deg,offset_rad,offset_mm"
-    assert "prismatic joints (3) are added to d" in controllers.dh_table(SCARA)
+    assert aj.files.zero_offsets_csv(found).splitlines()[3] == "joint,offset_deg,offset_rad,offset_mm"
+    assert "prismatic joints (3) are added to d" in aj.files.dh_table(SCARA)
     program: dict = {}
-    exec(controllers.python_program(SCARA, title="scara"), program)
+    exec(aj.files.python_program(SCARA, title="scara"), program)
     np.testing.assert_allclose(np.array([program["pose"](q) for q in Q]), SCARA.pose(Q), atol=1e-12)

@@ -53,9 +53,11 @@ def test_fingers_of_grippers_are_no_chains(tmp_path):
         for side in ("left", "right")
         for i in (1, 2)
     )
+    follower = joint("follower", "prismatic", "left_f1", "jaw", "", LIMIT + '<mimic joint="right_finger1"/>')
     path = tmp_path / "grippers.urdf"
-    path.write_text(f'<robot name="two"><link name="base"/>{LIFT}{SIDES}{fingers}</robot>')
-    assert [name for name, _ in aj.load_arm(path).chains] == ["left_tool", "right_tool"]
+    for more in ("", follower):
+        path.write_text(f'<robot name="two"><link name="base"/>{LIFT}{SIDES}{fingers}{more}</robot>')
+        assert [name for name, _ in aj.load_arm(path).chains] == ["left_tool", "right_tool"]
 
 
 def test_several_tips_are_a_robot(urdf):

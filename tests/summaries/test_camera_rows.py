@@ -14,7 +14,7 @@ LINK = (1.0, 2.0, 3.0)
 def test_of_an_arm_from_a_urdf_mounts_are_in_its_tip_link_and_places_in_its_base_link(camera_record, follows):
     [before] = camera_rows(camera_record)
     nominal = camera_record.recording.nominal
-    source = UrdfSource("", "base_link", "tool0", tuple(map(tuple, FIRST.tolist())), LINK, follows)
+    source = UrdfSource("", "base_link", ("tool0",), tuple(map(tuple, FIRST.tolist())), LINK, follows)
     recording = camera_record.recording._replace(nominal=nominal._replace(urdf=source))
     [row] = camera_rows(camera_record._replace(recording=recording))
     moved = np.asarray(camera_record.calibrated.arm.probe) - np.asarray(nominal.arm.probe)

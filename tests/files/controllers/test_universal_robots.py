@@ -6,7 +6,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.core.rotations import roll_pitch_yaw_matrix
 
-from ..refusals import assert_refused
+from ...refusals import assert_refused
 
 # Of a real robot: UniversalRobots/Universal_Robots_ROS2_Driver, ur_calibration/doc/algorithm.rst (BSD-3-Clause).
 REAL = {
@@ -94,6 +94,50 @@ def test_origins_of_a_published_table(tmp_path):
     assert {"beta_2", "beta_3"} <= set(read.free)
 
 
+# UR10e by the maker's nominal table (universal-robots.com, DH parameters), as a robot's urcontrol.conf has it, and what
+# the table of the real robot differs from it by, as a robot's calibration.conf has it.
+DH = {
+    "a": [0, -0.6127, -0.57155, 0, 0, 0],
+    "d": [0.1807, 0, 0, 0.17415, 0.11985, 0.11655],
+    "alpha": [1.570796327, 0, 0, 1.570796327, -1.570796327, 0],
+}
+NOMINAL = "[DH]\n" + "".join(f"{kind} = {row}  # m\n" for kind, row in DH.items()) + "[Tool]\na = [1, 2]\n"
+DELTA = "[mounting]\n" + "".join(
+    f"delta_{kind} = [{', '.join(repr(x) for x in np.subtract(row, DH.get(kind, 0)).tolist())}]\n"
+    for kind, row in REAL.items()
+)
+STATUS = "joint_checksum = [ 0x6e0f7bf, 0xa32a713f]\ncalibration_status = 2 # 0 == notInitialized / 2 == Linearised\n"
+
+
+def test_a_robots_own_files(tmp_path):
+    file(tmp_path, NOMINAL, "urcontrol.conf.UR10")
+    arm = aj.load_arm(file(tmp_path, DELTA + STATUS, "calibration.conf"))
+    assert np.abs([arm.a, arm.d]).max() < 700
+    np.testing.assert_allclose(arm.pose(Q), direct().pose(Q), rtol=0, atol=1e-9)
+    nominal = aj.load_arm(file(tmp_path, NOMINAL, "urcontrol.conf"))
+    np.testing.assert_allclose(nominal.d, 1000 * np.array(DH["d"]), atol=1e-6)
+    np.testing.assert_allclose(nominal.a, 1000 * np.array(DH["a"]), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("nominal", "text", "parts"),
+    [
+        ("", DELTA, ["0 files urcontrol.conf beside it", "put the robot's own there"]),
+        (NOMINAL, DELTA.replace("delta_a", "delta_x"), ["'delta_a' is missing"]),
+        (NOMINAL, DELTA + STATUS.replace("2 #", "1 #"), ["calibration_status is '1', not 2"]),
+        (NOMINAL.replace("alpha", "beta"), DELTA, ["'alpha' is missing"]),
+        (NOMINAL.replace("-0.6127", "x"), DELTA, ["'a' is", "six finite numbers"]),
+        (NOMINAL, "[mounting]\n", ["'a' is missing"]),
+        (NOMINAL.replace("-0.6127", "-0.425"), DELTA, ["differ", "give that of the robot's model"]),
+    ],
+)
+def test_refusals_of_a_robots_own_files(tmp_path, nominal, text, parts):
+    if nominal:
+        file(tmp_path, nominal, "urcontrol.conf")
+    path = file(tmp_path, text, "calibration.conf")
+    assert_refused(lambda: aj.load_arm(path), path, *parts)
+
+
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
@@ -103,8 +147,8 @@ def test_origins_of_a_published_table(tmp_path):
         (PARAMETERS.replace("439.140974079901", ""), ["'dh_d' is", "give six finite numbers"]),
         (PARAMETERS.replace("439.140974079901", "1e300"), ["'dh_d' is", "below 100000"]),
         (PARAMETERS + PARAMETERS, ["'dh_theta' occurs twice"]),
-        ("kinematics: [1, 2\nx y\n", ["line 2 is not of the form 'key: value'"]),
-        ("", ["is missing"]),
+        ("kinematics: [1, 2\nx y\n", ["line 3: the file is not valid YAML"]),
+        ("", ["has no 'key: value'"]),
     ],
 )
 def test_refusals(tmp_path, text, parts):

@@ -9,7 +9,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.kinematics.axes_to_dh import rotation
 
-from ..refusals import assert_refused
+from ...refusals import assert_refused
 
 Q = np.random.default_rng(0).uniform(-2, 2, (6, 7))
 DIMENSIONS = {"mm": 1.0, "m": 1000.0, "rad": 1.0, "deg": np.pi / 180}

@@ -9,10 +9,10 @@ import yourdfpy
 
 import aacmm_jax as aj
 
-from ..conftest import command_line
-from ..refusals import assert_refused
+from ...conftest import command_line
+from ...refusals import assert_refused
 
-FILE = Path(__file__).with_name("six_axis.urdf")
+FILE = Path(__file__).parents[1] / "six_axis.urdf"
 OFFSETS = np.array([0.01, -0.02, 0.003, 0.0, 0.05, -0.001])
 MOTORS = {
     name: {"id": i + 1, "drive_mode": 0, "homing_offset": 100 * i - 300, "range_min": 700 + i, "range_max": 3300 - i}

@@ -1,0 +1,11 @@
+from .devices import open_device as open_device
+from .devices.device import AbstractDevice as AbstractDevice
+from .places import Place as Place
+from .places import Setup as Setup
+from .places import TakenPose as TakenPose
+from .places import capture_of as capture_of
+from .places import setup_of as setup_of
+from .samples import Sample as Sample
+from .server import serving as serving
+from .session import Session as Session
+from .setups import read_setup as read_setup

@@ -1,0 +1,40 @@
+"""What devices give: one reading of a moment, of the joints, of an instrument, or of both."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+class Sample(NamedTuple):
+    """What one device has read at one moment; any part may be missing.
+
+    Args:
+        time: Of the device's own clock, or of the arrival, s.
+        q: Joint readings ``(n,)``, rad, or mm of prismatic joints.
+        columns: What was recorded beside them by name: ``temperature_C``, ``load_kg``, ``torque_1`` ..., and
+            ``button`` (1 while it is pressed).
+        measured: What an instrument measured, by the entries of its observation: ``points`` (a tracked point ``(3,)``
+            in the station's frame, mm), ``rotations`` ``(3, 3)``, ``values`` (a distance, mm), ``corners`` ``(c, 2)``
+            (px) with ``ids`` ``(c,)``.
+
+    Example:
+        >>> aj.live.Sample(0.01, np.zeros(6), {"temperature_C": 20.1}).columns["temperature_C"]
+        20.1
+    """
+
+    time: float
+    q: Float[np.ndarray, " n"] | None = None
+    columns: Mapping[str, float] = {}
+    measured: Mapping[str, Float[np.ndarray, "..."] | Int[np.ndarray, "..."]] = {}
+
+
+def mean_measured(measured: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
+    """What instruments saw of one pose: the mean of points and distances, the last of rotations and corners."""
+    values: dict[str, np.ndarray] = {}
+    for name in dict.fromkeys(name for one in measured for name in one):
+        rows = [np.asarray(one[name]) for one in measured if name in one]
+        averaged = name in ("points", "values")
+        values[name] = np.mean(rows, axis=0) if averaged else rows[-1]
+    return values

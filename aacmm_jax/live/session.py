@@ -1,0 +1,395 @@
+"""A live capture: devices are read, poses taken at rest and kept on disk, and the next one is proposed.
+
+Everything that people see is `Session.state`; everything that they do is a method.
+"""
+
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.errors import InputError
+from ..core.numpy_or_jax import to_numpy
+from ..data.recording import Recording
+from ..files.captures import save_capture
+from ..kinematics.arm import Arm, by_joint
+from . import guidance as guiding
+from .captured import Captured, Whereabouts
+from .devices import open_device
+from .devices.device import AbstractDevice
+from .journal import Journal, journal_of
+from .places import COLUMNS, Place, Setup, TakenPose, capture_of
+from .samples import Sample, mean_measured
+from .shown import headline, links_of, shown_readings, state_of
+from .stillness import Rest, Stillness
+
+_LOOK_EVERY = 0.1  # s of rest
+_MOST_MEASURED = 500
+_APART = 0.02  # rad, or m of prismatic joints: least change of a joint between two poses that are taken by themselves
+_LONGEST_TEXT = 200
+
+
+class Session:
+    """A live capture in progress; thread-safe. It reads its devices and computes guidance in threads of its own.
+
+    Args:
+        setup: The arm and the places (`setup_of`).
+        devices: Devices, or the texts that describe them. One at least reads the joints.
+        path: Where `finish` writes the capture; its journal is beside it, and is continued if it exists.
+        target: Expanded uncertainty (95 %) of a length that is enough, mm; None for none.
+        automatic: Whether a pose is taken by itself at every rest in a place.
+        stream: File to which everything that devices send is appended; by default it is not kept.
+
+    Raises:
+        InputError: A device or the journal cannot be used, or the journal is of another capture.
+
+    Example:
+        >>> import time
+        >>> setup = aj.live.setup_of(
+        ...     aj.files.load_specification("cheng2018-simulation"),
+        ...     aj.files.load_noise("cheng2018-simulation"),
+        ...     [aj.data.observations.SimulatedSocket("A", (400, 200, 300), 5)],
+        ... )
+        >>> with aj.live.Session(setup, ["simulated:?seed=1&speed=20"], path="live.h5") as session:
+        ...     while not session.state()["poses"]:
+        ...         time.sleep(0.02)
+        ...     print(session.state()["poses"][0]["place"])
+        A
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        devices: Sequence[AbstractDevice | str],
+        *,
+        path: str | os.PathLike = "capture.h5",
+        target: float | None = None,
+        automatic: bool = True,
+        stream: str | os.PathLike | None = None,
+    ):
+        self.setup, self.path, self.target = setup, Path(path), target
+        self._arm: Arm = to_numpy(setup.specification.arm)
+        self._lock, self._wake, self._stop = threading.RLock(), threading.Event(), threading.Event()
+        self._stream = None if stream is None else open(stream, "ab")  # noqa: SIM115 - closed by `close`
+        self._captured = Captured(setup)
+        self._auto, self._forced = automatic, None
+        self._version = self._sound = 0
+        self._where = Whereabouts(setup, self._arm, (), None)
+        self._next: guiding.NextPose | None = None
+        self._busy: str | None = None
+        self._message = ""
+        self._shown: tuple[int, dict[str, Any]] = -1, {}  # the version, and what is seen of it
+        self._q: Float[np.ndarray, " n"] | None = None
+        self._columns: dict[str, float] = {}
+        self._measured: list[Mapping[str, Any]] = []  # what instruments have seen since the arm is at rest
+        self._sample_times: deque[float] = deque(maxlen=50)
+        self._sample_time = -np.inf
+        self._taken_until = -np.inf  # time of the device up to which rest has been used
+        self._looked_at = -np.inf  # and when it was last looked at
+        self._taken_q: Float[np.ndarray, " n"] | None = None
+        self._stillness = Stillness(self._arm.joints)
+        self._button = False
+        self._journal, self._closed = Journal(journal_of(self.path)), False
+        self._devices: list[AbstractDevice] = []
+        self._threads: list[threading.Thread] = []
+        try:
+            self._captured.resume(self._journal)
+            self._where = Whereabouts(setup, self._arm, self._captured.poses, None)
+            if self._captured.poses:  # an arm that still is where it was when the last process ended is not taken again
+                self._taken_q = self._captured.poses[-1].q
+            self._devices = [open_device(d, setup) if isinstance(d, str) else d for d in devices]
+            self._check_devices()
+        except BaseException:
+            self.close()
+            raise
+        self._threads = [threading.Thread(target=self._compute, name="live guidance", daemon=True)]
+        for device in self._devices:  # each its own: one that cannot be reached holds up no other
+            self._threads.append(threading.Thread(target=self._read_device, args=(device,), daemon=True))
+        for thread in self._threads:
+            thread.start()
+        self._wake.set()
+
+    # What people do.
+
+    def take(self) -> int:
+        """Take the present pose; its number. `InputError` where the arm moves, or it is not clear where the tip is."""
+        with self._lock:
+            rest = self._stillness.rest
+            if rest is None:
+                raise InputError("the arm is moving; hold it still, then take the pose.")
+            place = self._place_at(self._tip_of(rest.q))
+            if place is None and self._next is not None:
+                place = self.setup.place(self._next.place)
+            if place is None:
+                raise InputError("it is not clear in which place the tip is; choose the place first.")
+            return self._take(rest, place)
+
+    def undo(self) -> None:
+        """Remove the last pose that was taken and not removed."""
+        with self._lock:
+            if not self._captured.poses:
+                raise InputError("there is no pose to undo.")
+            self._record({"event": "undo", "number": self._captured.poses[-1].number})
+
+    def exclude(self, pose: int, excluded: bool = True) -> None:
+        """Leave a pose out of the calibration, or take it in again."""
+        with self._lock:
+            if not any(taken.number == pose for taken in self._captured.poses):
+                raise InputError(f"there is no pose {pose}.")
+            self._record({"event": "exclude", "number": int(pose), "excluded": bool(excluded)})
+
+    def mark(self, text: str = "") -> None:
+        """Begin a new session: the probe was remounted, or the arm has warmed up."""
+        with self._lock:
+            self._record({"event": "mark", "text": str(text)[:_LONGEST_TEXT]})
+
+    def temperature(self, celsius: float | None) -> None:
+        """The thermometer's reading, C, of the poses from now on; None where a device reads it."""
+        if celsius is not None and not (np.isfinite(celsius) and -50 <= celsius <= 100):
+            raise InputError(f"the temperature is {celsius:g} C; give one between -50 and 100 C.")
+        with self._lock:
+            self._record({"event": "temperature", "celsius": None if celsius is None else float(celsius)})
+
+    def auto(self, on: bool) -> None:
+        """Whether a pose is taken by itself at every rest in a place."""
+        with self._lock:
+            self._auto = bool(on)
+            self._changed()
+
+    def place(self, name: str | None) -> None:
+        """Say in which place the tip is until it has left it; None where that is to be found from the readings."""
+        with self._lock:
+            self._forced = None if name is None else self.setup.place(name).name
+            self._changed(compute=True)
+
+    def finish(self, calibrate: bool = True) -> list[str]:
+        """Write the capture, and the calibration with its report; the names of the files. The session goes on."""
+        with self._lock:
+            poses, self._busy = list(self._captured.poses), "Calibrating" if calibrate else "Writing"
+            self._version += 1
+        try:
+            paths = self._written(poses, calibrate)
+        finally:
+            with self._lock:
+                self._busy = None
+                self._version += 1
+        with self._lock:
+            self._record({"event": "finished", "paths": paths})
+        return paths
+
+    def close(self) -> None:
+        """Stop; everything is on disk already."""
+        self._stop.set()
+        self._wake.set()
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(5.0)
+        for device in self._devices:
+            device.close()
+        self._devices = []
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
+        if not self._closed:
+            self._closed = True
+            self._journal.close()
+
+    def __enter__(self) -> "Session":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # What people see.
+
+    def state(self, since: int | None = None) -> dict[str, Any]:
+        """Everything that there is to see, as JSON may hold it; where nothing but the readings has changed since the
+        version ``since``, only these."""
+        with self._lock:
+            live = {"version": self._version, "sound": self._sound, "live": self._live()}
+            if since == self._version:
+                return live
+            if self._shown[0] != self._version:
+                state = state_of(self.setup, self._captured, self._where, self._next, self.target)
+                unread = [device.name for device in self._devices if not device.connected]
+                state |= {"headline": headline(self._busy, unread, state), "auto": self._auto}
+                self._shown = self._version, state | {"busy": self._busy, "message": self._message}
+            return live | self._shown[1]
+
+    def _live(self) -> dict[str, Any]:
+        rest, q, times = self._stillness.rest, self._q, self._sample_times
+        links = None if q is None else links_of(self._where.arm, q)
+        place = None if links is None else self._place_at(np.array(links[-1]))
+        lasted = times[-1] - times[0] if times else 0.0
+        return {
+            "q": None if q is None else shown_readings(self._arm, q),
+            "tip": links and links[-1],
+            "links": links,
+            "still": rest is not None,
+            "since": None if rest is None else rest.until - rest.since,
+            "rate": (len(times) - 1) / lasted if lasted > 0 else 0.0,
+            "place": place and place.name,
+            "devices": [device.state() for device in self._devices],
+        }
+
+    # Inside; with the lock held.
+
+    def _changed(self, compute: bool = False) -> None:
+        self._version += 1
+        if compute:
+            self._wake.set()
+
+    def _record(self, event: dict[str, Any]) -> None:
+        """Put an event on disk, and then into effect."""
+        if self._closed:
+            raise InputError("the session is closed; open it again.")
+        self._journal.append(event)
+        self._captured.apply(event)
+        self._where = Whereabouts(self.setup, self._arm, self._captured.poses, self._where.guidance)
+        self._changed(compute=True)
+
+    def _check_devices(self) -> None:
+        if not any(device.joints for device in self._devices):
+            raise InputError("no device reads the joints; add one with --device.")
+        for device in self._devices:
+            if device.joints not in (0, self._arm.joints):
+                raise InputError(
+                    f"device {device.name} reads {device.joints} joints, but the arm has {self._arm.joints}; correct "
+                    "its line format, or name the right arm."
+                )
+
+    def _say(self, error: Exception) -> None:
+        if self._message != in_words(error):
+            self._message = in_words(error)
+            self._changed()
+
+    def _place_at(self, tip: Float[np.ndarray, " 3"]) -> Place | None:
+        """The place that the tip is in: the one that was said, else the one that its position says."""
+        if self._forced is not None:
+            return self.setup.place(self._forced)
+        return self._where.place_at(tip, bool(self._measured), self._next and self._next.place)
+
+    def _tip_of(self, q: Float[np.ndarray, " n"]) -> Float[np.ndarray, " 3"]:
+        return np.array(links_of(self._where.arm, q)[-1])
+
+    def _take(self, rest: Rest, place: Place) -> int:
+        measured = mean_measured(self._measured) if place.is_free else {}
+        columns = {name: value for name, value in self._columns.items() if name != "button"}
+        if self._captured.temperature is not None:
+            columns[COLUMNS["thermometer"]] = self._captured.temperature
+        number = self._captured.number + 1
+        self._record(
+            {
+                "event": "pose", "number": number, "place": place.name, "time": time.time(),
+                "q": rest.q, "u": rest.u, "samples": rest.count, "columns": columns, "measured": measured,
+            }
+        )  # fmt: skip
+        self._taken_until, self._taken_q, self._forced = rest.until, rest.q, None
+        self._sound += 1
+        return number
+
+    # The threads.
+
+    def _read_device(self, device: AbstractDevice) -> None:
+        while not self._stop.is_set():
+            samples = device.read()
+            raw = b"" if self._stream is None else device.raw()
+            if not samples and not raw:
+                continue
+            with self._lock:
+                try:
+                    if self._stream is not None:
+                        self._stream.write(raw)
+                    self._add(samples)
+                except Exception as error:  # whatever one device sends, the others are read on
+                    self._say(error)
+
+    def _add(self, samples: Iterable[Sample]) -> None:
+        pressed = False
+        for sample in samples:
+            self._columns |= sample.columns
+            if sample.measured:
+                self._measured = [*self._measured[-_MOST_MEASURED:], sample.measured]
+            button = bool(self._columns.get("button", 0))
+            pressed, self._button = pressed or (button and not self._button), button
+            if sample.q is not None:
+                self._q = sample.q
+                if sample.time < self._sample_time:  # the device's clock began anew
+                    self._stillness, self._taken_until, self._looked_at = Stillness(self._arm.joints), -np.inf, -np.inf
+                self._sample_time = sample.time
+                self._stillness.add(sample)
+                if self._stillness.rest is None:
+                    self._measured = []
+                self._sample_times.append(sample.time)
+                self._take_by_itself()
+        if pressed:
+            self.take()
+
+    def _take_by_itself(self) -> None:
+        rest = self._stillness.rest
+        if not self._auto or rest is None or self._busy or rest.since <= self._taken_until:
+            return
+        if self._looked_at <= rest.until < self._looked_at + _LOOK_EVERY:
+            return
+        self._looked_at = rest.until
+        if self._taken_q is not None:
+            moved = np.abs(rest.q - self._taken_q) / np.array(by_joint(self._arm, 1.0, 1000.0))
+            if np.max(moved) < _APART:
+                return
+        place = self._place_at(self._tip_of(rest.q))
+        if place is not None:
+            self._take(rest, place)
+
+    def _compute(self) -> None:
+        guide: guiding.Guide | None = None  # made here, since it takes seconds
+        while not self._stop.is_set():
+            if not self._wake.wait(0.5):
+                continue
+            self._wake.clear()
+            with self._lock:
+                poses, q, forced = list(self._captured.poses), self._q, self._forced
+            try:
+                guide = guiding.Guide(self.setup, self.target) if guide is None else guide
+                found = guide.calibrated(poses)
+                proposed = guide.next_pose(found, q, forced)
+                message = ""
+            except Exception as error:  # poses are taken without guidance, too
+                found, proposed, message = None, None, in_words(error)
+            with self._lock:
+                self._where = Whereabouts(self.setup, self._arm, self._captured.poses, found)
+                self._next, self._message = proposed, message
+                self._changed()
+                if proposed is not None:
+                    for device in self._devices:
+                        device.asked(self.setup.place(proposed.place), proposed.q)
+
+    def _written(self, poses: list[TakenPose], calibrate: bool) -> list[str]:
+        from ..files.calibrations import save_calibration
+        from ..pipeline.capture_calibration import calibrate_capture
+        from ..report import write_report
+
+        capture, _ = capture_of(self.setup, poses)
+        recording = Recording(
+            capture, self.setup.specification, usual=self.setup.noise, measured=time.strftime("%Y-%m-%d")
+        )
+        save_capture(self.path, recording)
+        paths = [str(self.path)]
+        if calibrate:
+            scaled = capture.lengths or any(observation.fixes_scale for observation in capture.observations)
+            calibration = self.path.with_name(f"{self.path.stem}-calibration.h5")
+            save_calibration(calibration, calibrate_capture(recording, scale="measured" if scaled else "nominal"))
+            page = calibration.with_suffix(".html")
+            write_report(calibration, page)
+            paths += [str(calibration), str(page)]
+        return paths
+
+
+def in_words(error: Exception) -> str:
+    """The sentence of an error that says what to do; of any other, what failed."""
+    return str(error) if isinstance(error, InputError) else f"this failed ({type(error).__name__}: {error})"
