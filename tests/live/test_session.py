@@ -15,6 +15,7 @@ from aacmm_jax.live.devices.device import AbstractDevice
 from aacmm_jax.live.journal import Journal, journal_of
 from tests.live import killed
 
+pytestmark = pytest.mark.usefixtures("unguided")
 SETUP = killed.setup()
 ARM = SETUP.specification.arm
 
@@ -34,7 +35,7 @@ class Scripted(AbstractDevice):
         self.lines += len(samples)
         return samples
 
-    def hold(self, q, seconds=1.2, **columns):
+    def hold(self, q, seconds=1.8, **columns):
         """Move to a pose and hold it; waits until all was read."""
         path = [np.asarray(q) + 0.2 * (1 - i / 20) for i in range(20)] + [np.asarray(q)] * int(100 * seconds)
         samples = []
