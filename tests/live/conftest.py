@@ -3,10 +3,10 @@
 import pytest
 
 from aacmm_jax.live import guidance
+from tests.live.unguided import NoGuide
 
 
 @pytest.fixture
 def unguided(monkeypatch):
-    """Sessions without guidance, which takes most of the time and has tests of its own."""
-    monkeypatch.setattr(guidance, "calibrated", lambda *_: None)
-    monkeypatch.setattr(guidance, "next_pose", lambda *_: None)
+    """Sessions without guidance."""
+    monkeypatch.setattr(guidance, "Guide", NoGuide)

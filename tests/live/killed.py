@@ -10,6 +10,7 @@ import numpy as np
 import aacmm_jax as aj
 from aacmm_jax.live import guidance
 from aacmm_jax.live.devices.device import AbstractDevice
+from tests.live.unguided import NoGuide
 
 
 def setup():
@@ -48,7 +49,7 @@ class Hasty(AbstractDevice):
 
 def capture(path: str, seed: int, out: TextIO) -> None:
     """Capture until killed, without guidance; says "ready" and each pose."""
-    guidance.calibrated = guidance.next_pose = lambda *_: None
+    guidance.Guide = NoGuide
     with aj.live.Session(setup(), [Hasty(seed)], path=path) as session:
         told = {pose["number"] for pose in session.state()["poses"]}
         print("ready", file=out, flush=True)

@@ -221,8 +221,9 @@ def killed_at_random(folder: Path, kills: int, seed: int) -> dict[str, int]:
     """Kill a capture and continue it, so many times; every pose that it told must be in the journal, once."""
     path, told, dropped, moment = folder / "c.h5", {}, 0, random.Random(seed)
     for kill in range(kills):
-        command = [sys.executable, killed.__file__, str(path), str(kill)]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        command = [sys.executable, "-m", killed.__name__, str(path), str(kill)]
+        root = Path(killed.__file__).parents[2]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=root)
         assert process.stdout.readline() == "ready\n"
         time.sleep(moment.uniform(0.05, 2.5))
         process.kill()
