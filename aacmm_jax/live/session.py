@@ -347,6 +347,7 @@ class Session:
             self._take(rest, place)
 
     def _compute(self) -> None:
+        guide: guiding.Guide | None = None  # made here, since it takes seconds
         while not self._stop.is_set():
             if not self._wake.wait(0.5):
                 continue
@@ -354,8 +355,9 @@ class Session:
             with self._lock:
                 poses, q, forced = list(self._captured.poses), self._q, self._forced
             try:
-                found = guiding.calibrated(self.setup, poses, self.target)
-                proposed = guiding.next_pose(self.setup, poses, found, q, forced)
+                guide = guiding.Guide(self.setup, self.target) if guide is None else guide
+                found = guide.calibrated(poses)
+                proposed = guide.next_pose(found, q, forced)
                 message = ""
             except Exception as error:  # poses are taken without guidance, too
                 found, proposed, message = None, None, in_words(error)

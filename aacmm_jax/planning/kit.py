@@ -179,20 +179,21 @@ def _chosen(
         return [observation.select(part) for observation, part in zip(pool, parts, strict=True)]
 
     def near(chosen: list[AbstractObservation]) -> list[AbstractObservation]:
-        """The poses, and others near each: joints changed, and the tip brought back."""
-        poses = []
-        for thing, observation in zip(things, chosen, strict=True):
-            seat, q = thing.seat(problem.region), np.asarray(observation.q)
-            starts, which = problem.near(q)
-            moved, good = reached(seat, starts, np.asarray(seat.arm.position(q))[which])
-            good[good] = thing.usable(problem.region, moved[good], problem.options.retract)
-            rows = np.concatenate([np.arange(len(q)), which[good]])
-            order = np.argsort(observation.places[rows], kind="stable")
-            q = np.concatenate([q, moved[good]])[order]
-            poses.append(thing.recorded(problem.region, q, observation.select(rows[order])))
-        return poses
+        return [neighbours(problem, thing, poses) for thing, poses in zip(things, chosen, strict=True)]
 
     return best_poses(problem, pool, poses, least, lambda pool: candidates_of_kit(problem, pool), taken, near)
+
+
+def neighbours(problem: DesignProblem, thing: Thing, poses: AbstractObservation) -> AbstractObservation:
+    """The poses in a thing, and others near each: joints changed, and the tip brought back."""
+    seat, q = thing.seat(problem.region), np.asarray(poses.q)
+    starts, which = problem.near(q)
+    moved, good = reached(seat, starts, np.asarray(seat.arm.position(q))[which])
+    good[good] = thing.usable(problem.region, moved[good], problem.options.retract)
+    rows = np.concatenate([np.arange(len(q)), which[good]])
+    order = np.argsort(poses.places[rows], kind="stable")
+    q = np.concatenate([q, moved[good]])[order]
+    return thing.recorded(problem.region, q, poses.select(rows[order]))
 
 
 def _in_order(
