@@ -60,7 +60,8 @@ def export(
     | None = option(
         "toml: arm file; json: complete summary; csv: parameters; dcc: Digital Calibration Certificate (XML); urdf, "
         "mjcf: the URDF or MJCF of the nominal arm, with calibrated origins; table: D-H table (CSV); offsets: "
-        "refitted zero offsets of the joints only; ur: kinematics.yaml of Universal Robots; python: a program that "
+        "refitted zero offsets of the joints only, for controllers that can master an axis at a stated reading (ABB, "
+        "FANUC, Staeubli and others); ur: kinematics.yaml of Universal Robots; python: a program that "
         "needs only NumPy; "
         "camera-info: intrinsics of a camera (ROS, YAML); joint-origin, static-transform, opencv, matrix: frame of a "
         "camera or target, as the fixed joint of a URDF, a command of ROS 2, YAML of OpenCV, or 4 x 4 matrix (mm); "
