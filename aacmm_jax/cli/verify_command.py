@@ -26,7 +26,8 @@ def verify(
     ),
     delivered: str | None = option(
         "Arm with the parameters that the maker or controller states: a kinematics.yaml or calibration.conf (Universal "
-        "Robots), a URDF, an MJCF, or a TOML file with D-H parameters and zero offsets. Default: as_found of the manifest.",
+        "Robots), a URDF, an MJCF, or a TOML file with D-H parameters and zero offsets. Default: as_found of the "
+        "manifest.",
         "ARM",
     ),
     base: str | None = options.BASE_LINK,
