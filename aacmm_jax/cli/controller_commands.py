@@ -11,7 +11,6 @@ import typer
 from .. import files, kinematics, summaries
 from ..core.errors import InputError
 from ..core.text import printable, shorten
-from ..files.controllers import ZERO_FILES
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import check_kept, together, write_text
 from . import options
@@ -188,6 +187,8 @@ def _zero_offsets(record: Any) -> Any:
 
 def _zeros_in_file(record: Any, form: str, file: Path | None, motors: str | None) -> tuple[str, list[str]]:
     """A controller's file with the zero offsets, and what they leave."""
+    from ..files.controllers import ZERO_FILES
+
     zeros, source = _zero_offsets(record), record.recording.nominal.urdf
     if file is None:
         if source is None:
