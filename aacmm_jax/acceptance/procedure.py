@@ -12,7 +12,7 @@ from ..core.errors import InputError
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise
 from ..data.recording import ProbedSphere, Recording, SphereTest
-from ..kinematics.arm import Arm, is_single
+from ..kinematics.arm import Arm, is_single, one_chain
 from ..kinematics.inverse_kinematics import project_to_targets
 from ..kinematics.parameters import ArmSpecification
 from ..kinematics.workspace import Reach, SearchRegion, arm_reach, configurations_at, lowest_point, search_region
@@ -120,6 +120,7 @@ def plan_procedure(
     """
     if not is_single(arm):
         raise InputError("plan_procedure takes one arm, not a batch; give one arm of the batch.")
+    arm = one_chain(arm, "an acceptance test")
     search, reach = search_region(arm, None, margin, above, seed), arm_reach(arm)
     if reach.radius < 10 * diameter:
         raise InputError(

@@ -125,8 +125,9 @@ def arm(
 
 
 def first_frame(specification: Any) -> Any:
-    """The first frame of an arm in the base link of its URDF; None for other arms."""
-    return None if specification.urdf is None else files.urdf_chain(specification.urdf).base
+    """The first frame of an arm, of a robot that of its first chain, in the base link of its URDF; None for others."""
+    urdf = specification.urdf
+    return None if urdf is None else files.urdf_chain(urdf._replace(tips=urdf.tips[:1]), alone=len(urdf.tips) == 1).base
 
 
 def _checked(specification: Any, path: Path, unit: str | None) -> dict[str, Any]:

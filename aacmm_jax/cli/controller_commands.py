@@ -16,6 +16,8 @@ from ..files.outputs import check_kept, together, write_text
 from . import options
 from .app import command, show_summary, warn_of_unusable
 from .arm_command import first_frame
+from .chains import named_chain, one_chain_of
+from .commanded import at_temperature, in_first_frame
 from .options import argument, flag, names_option, numbers_option, option, output
 
 _ROBOTS = ("urdf", "mjcf")
@@ -23,6 +25,7 @@ _FORMATS = {".urdf": "urdf", ".xml": "mjcf", ".json": "json", ".csv": "csv", ".p
 _FORMATS |= dict.fromkeys((".yaml", ".yml"), "ur")
 _ZEROS = ("lerobot", "kuka", "ros-calibration")  # all but the last need --file
 _OF_CAMERA = ("camera-info", "joint-origin", "static-transform", "opencv", "matrix")
+_OF_ONE_CHAIN = ("toml", "table", "offsets", "ur", "python", *_ZEROS)
 _OF_ONE_ARM = ("toml", *_ROBOTS, "table", "ur", "python")
 
 
@@ -31,6 +34,7 @@ _OF_ONE_ARM = ("toml", *_ROBOTS, "table", "ur", "python")
     "aacmm export calibration.h5 -o robot.urdf",
     "aacmm export calibration.h5 --format table --convention craig --units m-rad",
     "aacmm export calibration.h5 --format camera-info --camera webcam -o webcam.yaml",
+    "aacmm export calibration.h5 --format table --chain left",
     "aacmm export calibration.h5 --format joint-origin",
     "aacmm export calibration.h5 --format dcc --evaluation tests.h5 --about laboratory.toml -o certificate.xml",
 )
@@ -78,6 +82,11 @@ def export(
     ),
     convention: Literal["standard", "craig"] | None = option("D-H convention for --format table. Default: standard."),
     units: Literal["mm-deg", "m-rad"] | None = option("Units for --format table. Default: mm-deg."),
+    chain: str | None = option(
+        "Chain of a robot to write, in the base frame of this chain; needed for table, offsets, ur, python, lerobot, "
+        "kuka and ros-calibration, possible for toml.",
+        "NAME",
+    ),
     camera: str | None = option(
         "Camera to write, if the calibration has several: its name, or that of the observation.", "NAME"
     ),
@@ -122,6 +131,10 @@ def export(
     notes: list[str] = []
     with together(output):
         record = files.load_calibration(read := InputFile(calibration))
+        if chain is not None:
+            if written_as not in _OF_ONE_CHAIN:
+                raise InputError(f"--chain applies to --format {', '.join(_OF_ONE_CHAIN)} only; leave it out.")
+            record = one_chain_of(record, chain)
         nominal = record.recording.nominal
         arms = {"calibrated": record.calibrated, "nominal": nominal, "true": record.recording.true}
         specification = arms[which or "calibrated"]
@@ -292,6 +305,7 @@ def _certificate(calibration: InputFile, record: Any, about: Path | None, evalua
 
 @command(
     "aacmm correct calibration.h5 poses.csv -o corrected.csv --unit deg",
+    "aacmm correct robot.h5 left.csv -o corrected.csv --unit deg --chain left",
     "aacmm correct calibration.h5 points.csv -o commanded.csv --unit deg --near 0,-90,90,0,90,0 --write poses",
     "aacmm correct calibration.h5 poses.csv -o corrected.csv --unit deg --near 0,-90,90,0,90,0 --probe 0,0,150",
 )
@@ -332,6 +346,9 @@ def correct(
         "temperature_C of the table.",
         "C",
     ),
+    chain: str | None = option(
+        "Chain of a robot that the table is of; its columns are the joints of this chain.", "NAME"
+    ),
     write: Literal["readings", "poses"] = option(
         "What to write: corrected joint readings, or, for a controller that takes poses only, the corrected poses to "
         "command, in the units and columns of the table.",
@@ -367,14 +384,21 @@ def correct(
     with together(output):
         record = files.load_calibration(InputFile(calibration))
         nominal, calibrated = to_numpy((record.recording.nominal.arm, record.calibrated.arm))
+        own = named_chain(nominal, chain)
         if probe is not None:
             tool = numbers_option("--probe", probe, "X,Y,Z in mm", 3)
             nominal, calibrated = nominal.replace(probe=tool), calibrated.replace(probe=tool)
         commanded = read_poses(
-            InputFile(poses), nominal, unit=unit, near=begin, columns=picked, length_unit=length_unit
+            InputFile(poses),
+            nominal if own is None else own.arm,
+            unit=unit,
+            near=begin,
+            columns=picked,
+            length_unit=length_unit,
         )
-        q = _at_temperature(commanded, calibrated, temperature)
-        meant = np.array(nominal.pose(q[:, : nominal.joints]))
+        given = commanded if own is None else commanded._replace(q=own.readings(commanded.q))
+        q = at_temperature(given, calibrated, temperature)
+        meant = np.array(nominal.pose(q[:, : nominal.beside.own]))
         oriented = commanded.oriented or commanded.poses is None
         targets = meant if commanded.poses is None else in_first_frame(record, commanded.poses)
         targets[:, :3, :3] = targets[:, :3, :3] if oriented else meant[:, :3, :3]
@@ -385,12 +409,15 @@ def correct(
             text = corrected_poses_csv(commanded, in_file, np.asarray(corrected.reached))
         else:
             corrected = kinematics.readings_at_poses(calibrated, q, targets, nominal.limits)
-            text = corrected_csv(commanded, np.asarray(corrected.q), np.asarray(corrected.reached))
+            found = np.asarray(corrected.q)
+            found = found if own is None else own.of_robot(found)
+            text = corrected_csv(commanded, found, np.asarray(corrected.reached))
         summary = summaries.correction.correction_summary(
             nominal, calibrated, q, corrected, unit=commanded.unit, of_readings=commanded.poses is None
         )
-        summary["probe_mm"] = [np.asarray(arm.probe).tolist() for arm in (nominal, calibrated)]
-        if commanded.temperature is not None and q.shape[1] == calibrated.joints:
+        tip = slice(None) if own is None else slice(3 * own.number, 3 * own.number + 3)
+        summary["probe_mm"] = [np.asarray(arm.probe)[tip].tolist() for arm in (nominal, calibrated)]
+        if commanded.temperature is not None and q.shape[1] == calibrated.beside.own:
             summary["warnings"].append(
                 "The arm was calibrated without thermal expansion, so the column temperature_C has no effect; "
                 "calibrate with --model expansion to correct for temperature."
@@ -401,40 +428,3 @@ def correct(
     show_summary(summary, as_json, summaries.correction.corrections)
     if summary["not_reached"]:
         raise typer.Exit(1)
-
-
-def _at_temperature(commanded: Any, calibrated: Any, temperature: float | None) -> np.ndarray:
-    """The readings, with the temperature of an arm that expands."""
-    from ..data.capture_data import check_temperatures
-    from ..files.manifest_readings import stated_or_recorded
-    from ..files.table_columns import TEMPERATURE
-    from ..kinematics.arm import correction_names
-    from ..kinematics.corrected_arm import loads_of
-    from ..kinematics.recorded_kinds import Expansion
-
-    torques = calibrated.corrections is not None and "torques" in calibrated.corrections.functions.columns
-    if torques and loads_of(calibrated) is None:
-        raise InputError(
-            "the arm was calibrated with measured torques, but those of commanded poses are unknown without masses; "
-            "calibrate with --model gravity, or with an arm whose masses are known."
-        )
-    if Expansion.words[0] not in correction_names(calibrated):
-        if temperature is not None:
-            raise InputError("the arm was calibrated without thermal expansion; leave out --temperature.")
-        return commanded.q
-    if commanded.temperature is None and temperature is None:
-        raise InputError(
-            "the arm was calibrated with its thermal expansion; give --temperature, or a column temperature_C."
-        )
-    table = str(commanded.table.path)
-    column = None if commanded.temperature is None else commanded.temperature[:, None]
-    recorded = stated_or_recorded(temperature, column, TEMPERATURE, table, len(commanded.q))
-    assert recorded is not None
-    check_temperatures("--temperature" if commanded.temperature is None else table, recorded)
-    return calibrated.beside.laid_out(np.hstack([commanded.q, recorded]), ("thermometer",))
-
-
-def in_first_frame(record: Any, poses: np.ndarray) -> np.ndarray:
-    """Poses in the frame in which the Denavit-Hartenberg chain begins; of a URDF they are given in its base link."""
-    urdf = record.recording.nominal.urdf
-    return poses if urdf is None else np.linalg.inv(files.urdf_chain(urdf).base) @ poses

@@ -15,6 +15,7 @@ from ..core.text import listed, number
 from ..core.units import DEG
 from ..files.inputs import ROBOT_FILES
 from ..files.outputs import together, write_text
+from ..kinematics.arm import by_joint
 from . import options
 from .app import command, progress_bar, show_summary, with_spinner
 from .options import bad_option, flag, option, output, seed
@@ -25,11 +26,12 @@ _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 # Options that each way of planning takes besides those of all: of a calibration with sockets, of one with a kit, and
 # of an acceptance test.
+_OF_CHAINS = {"chain", "rest"}
 _OF_ALL = {"arm", "output", "manifest", "base", "tip", "seed", "as_json", "angles", "margin_deg", "above_mm"}
 _OF_CALIBRATIONS = {
     *("poses", "model", "held", "encoder_arcsec", "linear_encoder_mm", "seating_mm", "tool_axis", "retract_mm", "cell"),
     *("collisions", "link_radius_mm", "unconstrained", "criterion", "region", "candidates", "check_length_mm"),
-    *("farthest", "both_sides"),
+    *("farthest", "both_sides", *_OF_CHAINS),
 }
 _OF_SOCKETS = {"sockets", "socket", "length", "length_mm", "u_mm", "cone_deg", "normal"}
 _OF_ACCEPTANCE = {"acceptance", "sphere_mm", "stylus_mm", "bar_mm", "range_mm"}
@@ -112,6 +114,14 @@ def plan(
         "--unconstrained",
         "Also predict the uncertainty of a plan without obstacles, approach points and limits of the tool "
         "direction (--cone-deg).",
+    ),
+    chain: list[str] | None = option(
+        "Plan poses for this chain of a robot; may be given several times. Default: all chains.", "NAME"
+    ),
+    rest: str | None = option(
+        "Readings of all joints of a robot (unit of --angles, mm for prismatic joints) that the joints of the other "
+        "chains hold while a chain takes a pose. Default: 0, or the middle of limits that exclude 0.",
+        "Q1,Q2,...",
     ),
     angles: Literal["deg", "rad"] = option("Unit of the joint readings in the plan and its manifest.", default="deg"),
     criterion: Literal["length", "A", "D", "E"] = option(
@@ -276,6 +286,8 @@ def _planned(specification: Any, given: Mapping[str, Any], links: Mapping[str, A
         margin=given["margin_deg"] * DEG,
         above=given["above_mm"],
         check_length=given["check_length_mm"],
+        chains=tuple(given["chain"] or ()),
+        rest=_rest(given["rest"], specification.arm, given["angles"]),
         **{name: given[name] for name in ("criterion", "unconstrained", "candidates", "seed")},
     )
     stated = {"noise_source": noise.source, "notes": [] if loaded is None else list(loaded.notes)}
@@ -317,6 +329,18 @@ def arm_for(manifest: Path, arm: str) -> str:
         return Path(os.path.relpath(arm, manifest.parent)).as_posix()
     except ValueError:  # on another drive
         return Path(arm).absolute().as_posix()
+
+
+def _rest(text: str | None, arm: Any, angles: str) -> list[float] | None:
+    """Readings of all joints at rest, rad or mm."""
+    if text is None:
+        return None
+    try:
+        values = [number(part.strip()) for part in text.split(",")]
+    except ValueError:
+        bad_option("--rest", text, "one reading per joint, separated by commas")
+    units = by_joint(arm, DEG if angles == "deg" else 1.0, 1.0)
+    return values if len(values) != len(units) else [x * unit for x, unit in zip(values, units, strict=True)]
 
 
 def _range(text: str) -> tuple[float, float]:

@@ -21,6 +21,7 @@ from ..kinematics.inverse_kinematics import project_to_targets, random_configura
 from .capture import Capture
 from .capture_data import ReferenceLength, check_temperatures
 from .noise import Noise
+from .observations.contacts import AbstractSimulatedContact
 from .observations.declared import MOST_POSES
 from .observations.observation import AbstractObservation
 from .observations.simulated import AbstractSimulated
@@ -117,14 +118,20 @@ def simulate(
     exact = np.repeat(places, list(counts.values()), axis=0)
     references = _reference_lengths(points, lengths, length_key)
     labels = np.repeat([f"socket '{name}'" for name in counts], list(counts.values())).tolist()
-    taken = _chain_numbers(arm, chains, {**counts}, [thing.name for thing in simulated])
+    contacts = {thing.name: thing.carrying for thing in simulated if isinstance(thing, AbstractSimulatedContact)}
+    taken = _chain_numbers(arm, contacts | dict(chains or {}), {**counts}, [thing.name for thing in simulated])
     of_poses = np.concatenate([np.resize(taken[name], count) for name, count in counts.items()] or [np.zeros(0, int)])
     angles = recorder.read(recorder.configurations(arm, exact, reach_key, seat_key, labels, of_poses), encoder_key)
     ends = np.cumsum(list(counts.values()))
     readings = {name: angles[end - count : end] for (name, count), end in zip(counts.items(), ends, strict=True)}
     keys = [jax.random.fold_in(random_key(seed), number) for number in range(len(simulated))]
     pairs = zip(simulated, keys, strict=True)
-    others = [recorder.recorded(thing, key, taken.get(getattr(thing, "name", ""))) for thing, key in pairs]
+    others = []
+    for thing, key in pairs:
+        observation, transforms = recorder.recorded(thing, key, taken.get(getattr(thing, "name", "")))
+        others.append(observation)
+        if isinstance(thing, AbstractSimulatedContact):
+            readings |= recorder.touching(thing, transforms, key)
     return Capture(readings, references, others)
 
 
@@ -176,8 +183,8 @@ class _Recorder(NamedTuple):
 
     def recorded(
         self, simulated: AbstractSimulated, key: Array, chain: Int[np.ndarray, " c"] | None
-    ) -> AbstractObservation:
-        """One simulated observation."""
+    ) -> tuple[AbstractObservation, Float[np.ndarray, "m 4 4"]]:
+        """One simulated observation, and the true transforms of its tips."""
         if not isinstance(simulated, AbstractSimulated):
             raise InputError(
                 f"{simulated!r} cannot be simulated; give a simulated observation from aj.data.observations, such "
@@ -193,24 +200,39 @@ class _Recorder(NamedTuple):
         # An instrument sees the tip where it is: the seat's error moves the tip, and not what it is compared with.
         transforms = np.asarray(holding.pose(angles)).copy()
         transforms[:, :3, 3] = exact
-        return simulated.recorded(self.read(angles, encoder_key), transforms, random)
+        return simulated.recorded(self.read(angles, encoder_key), transforms, random), transforms
+
+    def touching(
+        self, contact: AbstractSimulatedContact, transforms: Float[np.ndarray, "m 4 4"], key: Array
+    ) -> dict[str, Float[np.ndarray, "1 columns"]]:
+        """The poses of the chain that touches a surface, each a socket of its own."""
+        reach_key, seat_key, encoder_key, own_key = jax.random.split(jax.random.fold_in(key, 1), 4)
+        points = contact.touched(transforms, np.random.default_rng(np.asarray(jax.random.key_data(own_key))))
+        chain = np.repeat(_numbers(self.arm, (contact.touching,)), contact.poses)
+        labels = [f"contact '{name}'" for name in contact.sockets]
+        q = self.read(self.configurations(self.arm, points, reach_key, seat_key, labels, chain), encoder_key)
+        return dict(zip(contact.sockets, q[:, None], strict=True))
 
 
 def _chain_numbers(
     arm: Arm, given: Mapping[str, str | Sequence[str]] | None, sockets: Mapping[str, int], others: Sequence[str]
 ) -> dict[str, Int[np.ndarray, " c"]]:
     """Numbers of the chains that take turns at each socket and observation, by default all."""
-    numbers = {name: number for number, (name, _) in enumerate(arm.chains)}
     taken = {name: np.arange(tips_of(arm)) for name in (*sockets, *others)}
     for where, names in (given or {}).items():
         if where not in taken:
             raise InputError(f"chains are given for '{where}', which is not simulated{nearest(where, taken)}")
-        chosen = (names,) if isinstance(names, str) else tuple(names)
-        for name in chosen:
-            if name not in numbers:
-                raise InputError(f"the robot has no chain '{name}'{nearest(str(name), numbers)}")
-        taken[where] = np.array([numbers[name] for name in chosen])
+        taken[where] = _numbers(arm, (names,) if isinstance(names, str) else tuple(names))
     return taken
+
+
+def _numbers(arm: Arm, names: Sequence[str]) -> Int[np.ndarray, " c"]:
+    """Numbers of chains by their names."""
+    numbers = {name: number for number, (name, _) in enumerate(arm.chains)}
+    for name in names:
+        if name not in numbers:
+            raise InputError(f"the robot has no chain '{name}'{nearest(str(name), numbers)}")
+    return np.array([numbers[name] for name in names])
 
 
 def _ends(arm: Arm, given: Numbers | None, name: str) -> Float[np.ndarray, " 2"]:

@@ -9,7 +9,7 @@ from ..core.units import ARCSEC
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .culprits import Culprit, culprits_of
 from .determined import effect_of_bounds
-from .findings import Case, Finding, chance_text, rounded
+from .findings import Case, Finding, chance_text, look_for_play, rounded
 from .held_arm import errors_of_held
 from .missing_terms import FoundTerm, wider_model
 
@@ -35,7 +35,9 @@ def test(case: Case) -> list[Finding]:
             findings.append(_of_terms(case, [c.term for c in culprits if c.term is not None], explains))
             continue
         probability = max(culprit.probability for culprit in culprits)
-        findings.append(_FINDINGS[kind](culprits)._replace(explains=explains, probability=probability))
+        finding = _FINDINGS[kind](culprits)._replace(explains=explains, probability=probability)
+        advice = look_for_play(case, len(finding.concerns)) if kind == "noisy joint" else finding.advice
+        findings.append(finding._replace(advice=advice))
     return findings
 
 
@@ -130,7 +132,6 @@ def _of_joints(culprits: Sequence[Culprit]) -> Finding:
         "noisy-encoder",
         f"Residuals are larger where the reading of {shorten(joints, 3)} moves the tip more ({chance}), as if "
         f"{encoders} noisier than the others.",
-        advice=f"State the noise of each joint, or look for play in {'these joints' if several else 'this joint'}.",
         severity="doubt",
         concerns=tuple(joints),
     )

@@ -117,7 +117,11 @@ def _groups(blocks: Sequence[Block]) -> list[Hashable]:
 
 
 def contradicting_groups(
-    blocks: Sequence[Block], *, level: float = 0.01, least_ratio: float = 1.0
+    blocks: Sequence[Block],
+    *,
+    level: float = 0.01,
+    least_ratio: float = 1.0,
+    scales: Sequence[frozenset[Hashable]] = (),
 ) -> list[list[GroupTest]]:
     """Find the groups of poses that contradict the others.
 
@@ -128,6 +132,9 @@ def contradicting_groups(
     ``level`` is the probability of finding any group where nothing is wrong (Bonferroni's bound). Returned are the test
     of each group that was found, without those before it; and after it, as its alternatives, the tests of groups
     without which the others agree as well (of two groups that contradict each other, either).
+
+    ``scales`` are the groups that each reference length joins, where lengths alone fix the scale. A group that all of
+    them need is not tested: without it the arm could shrink, and the residuals of the others with it to nothing.
     """
     grams = {group: _Gram.of(block for block in blocks if block.group == group) for group in (*_groups(blocks), None)}
     contradicting: list[list[GroupTest]] = []
@@ -138,8 +145,9 @@ def contradicting_groups(
         whole = _Gram(np.sum([gram.matrix for gram in left], axis=0), sum(gram.rows for gram in left))
         diagonal, tests = np.diag(whole.matrix)[:-1], []
         everything = whole.fit(diagonal)
+        scales = [groups for groups in scales if groups <= grams.keys()]
         for group, gram in grams.items():
-            if group is None:
+            if group is None or (scales and all(group in groups for groups in scales)):
                 continue
             others = _Gram(whole.matrix - gram.matrix, whole.rows - gram.rows).fit(diagonal)
             added, freedom = everything.degrees_of_freedom - others.degrees_of_freedom, others.degrees_of_freedom

@@ -32,6 +32,10 @@ from .equations import EXACT, Block, Equations, Rows, equations_of, in_chunks, r
 from .residual_tests import Residuals
 
 Severity = Literal["unusable", "doubt", "note"]
+RECORD_DIRECTIONS = (
+    "Record from which side each joint was approached (columns direction_1, direction_2, ...): backlash is then "
+    "tested, and corrected if it is there."
+)
 _SEVERITIES: tuple[Severity, ...] = ("unusable", "doubt", "note")  # the most serious first
 _FEWEST = 6  # degrees of freedom below which residuals say nothing
 
@@ -262,6 +266,12 @@ def warnings_of(
         Hold out a second reference length as a check.
     """
     return sentences(findings_of(result, capture, class_noise=class_noise))
+
+
+def look_for_play(case: Case, joints: int = 1) -> str:
+    """What to do where joints may have play: to record directions, where these would decide it and none are there."""
+    advice = f"State the noise of each joint, or look for play in {'these joints' if joints > 1 else 'this joint'}."
+    return advice if "directions" in case.record.recording.nominal.arm.recorded else f"{advice} {RECORD_DIRECTIONS}"
 
 
 def chance_text(probability: float) -> str:

@@ -28,7 +28,7 @@ from ..core.text import shorten
 from ..data.noise import Noise, one_arcsec
 from .culprits import MOST_CAUSES, culprits_of, explained
 from .equations import Block, Rows
-from .findings import Case, Finding, by_equations, chance_text, reading_text
+from .findings import Case, Finding, by_equations, chance_text, look_for_play, reading_text
 from .residual_tests import SURE, Residuals, chance_above_zero
 
 ORDER, NEEDS = 40, "scale"
@@ -82,7 +82,7 @@ def test(case: Case) -> list[Finding]:
                 f"Residuals are larger where the reading of joint {noisiest.joint} moves the tip more "
                 f"({chance_text(noisiest.probability)}), as if the encoder of this joint were noisier than the "
                 "others.",
-                advice="State the noise of each joint, or look for play in this joint.",
+                advice=look_for_play(case),
                 severity="doubt",
                 probability=noisiest.probability,
                 concerns=(f"joint {noisiest.joint}",),

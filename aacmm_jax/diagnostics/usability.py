@@ -13,7 +13,7 @@ from ..kinematics.parameters import Parameters
 from .contradictions import session_metrics
 from .culprits import missing
 from .equations import EXACT
-from .findings import Case, Finding, findings_of
+from .findings import RECORD_DIRECTIONS, Case, Finding, findings_of
 from .joint_travel import standing_rows
 from .mistakes import mistake_in_data
 from .noisy_encoders import noisiest_joint
@@ -23,6 +23,7 @@ from .residual_tests import SURE
 ORDER, NEEDS = 10, "nothing"
 _APART = 5.0  # RMS of a session among others, over that which it has alone, beyond which they are not of one arm
 _MOST, _FEW = 0.5, 0.05  # part of the squared residuals that a few poses have, where they are the reason
+_PLAY = "play in the joints, or another effect that the model does not describe"
 
 
 def test(case: Case) -> list[Finding]:
@@ -81,7 +82,8 @@ def _of_residuals(case: Case) -> Finding:
         doubt = f"large residuals, most likely {mistake.says.removeprefix('Likely cause: ').rstrip('.')}"
         return finding._replace(code="large-residuals", severity="doubt", doubt=doubt)
     reason = case.once(likely_reason)
-    finding = finding._replace(advice=f"Most likely: {reason}.")
+    record_sides = reason == _PLAY and "directions" not in record.recording.nominal.arm.recorded
+    finding = finding._replace(advice=f"Most likely: {reason}.{f' {RECORD_DIRECTIONS}' if record_sides else ''}")
     if record.implausible_residual:
         return finding._replace(doubt=f"residuals are too large for this arm; most likely {reason}")
     return finding._replace(code="large-residuals", severity="doubt", doubt=f"large residuals, most likely {reason}")
@@ -116,7 +118,7 @@ def likely_reason(case: Case) -> str:
         bending = [str(term.joint) for term in case.once(missing) if term.kind == "gravity"]
         if bending:
             return f"bending under gravity (joint {shorten(bending)})"
-        return "play in the joints, or another effect that the model does not describe"
+        return _PLAY
     return (
         "another arm than the one named, rows that belong to other sockets or positions, or measured values that are "
         "less certain than stated"

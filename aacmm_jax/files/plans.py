@@ -18,8 +18,9 @@ from ..data.observations.declared import FREE, Entry
 from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation
 from ..data.observations.pixels import Pixels
-from ..kinematics.arm import by_joint
+from ..kinematics.arm import Arm, by_joint
 from ..kinematics.parameters import UrdfSource
+from ..kinematics.robots import chain_of, chains_taken
 from ..planning.design import Plan
 from ..planning.kit import KitPlan
 from .outputs import write_text
@@ -35,8 +36,9 @@ def save_plan(path: str | os.PathLike, plan: Planned, *, angles: Angles = "deg")
 
     Columns: ``pose``, ``move`` (where there are approach points: "approach", "pose" and "retract" for each pose),
     ``socket`` (of a kit: ``observation`` and ``point``; of an acceptance test: ``test``, ``name`` and the ``file`` for
-    the reading), ``x_mm``, ``y_mm``, ``z_mm`` (the tip), ``q_1_deg`` or ``q_1_rad`` and so on (joint readings;
-    ``q_1_mm`` of a prismatic joint), ``probe_direction_x``, ``_y``, ``_z`` (the last frame's z axis).
+    the reading), ``chain`` (of a robot, whose other joints are at rest), ``x_mm``, ``y_mm``, ``z_mm`` (the tip),
+    ``q_1_deg`` or ``q_1_rad`` and so on (joint readings; ``q_1_mm`` of a prismatic joint), ``probe_direction_x``,
+    ``_y``, ``_z`` (the last frame's z axis).
 
     Args:
         path: the file to write.
@@ -71,6 +73,8 @@ def plan_csv(plan: Planned, angles: Angles = "deg", both_sides: bool = False) ->
             [[item.test, item.name, _file_of(plan, item)] for item in items for _ in item.q],
         )
         q, tips = (np.concatenate([getattr(item, kind) for item in items]) for kind in ("q", "points"))
+    headings = [*headings, "chain"] if plan.arm.chains else headings
+    labels = [[*label, *chain] for label, chain in zip(labels, _chain_labels(plan.arm, q), strict=True)]
     readings = [f"q_{i}_{unit}" for i, unit in enumerate(by_joint(plan.arm, angles, "mm"), start=1)]
     direction = [f"probe_direction_{axis}" for axis in "xyz"]
     move = [] if moved is None and not both_sides else ["move"]
@@ -79,7 +83,7 @@ def plan_csv(plan: Planned, angles: Angles = "deg", both_sides: bool = False) ->
     units = np.array(by_joint(plan.arm, unit, 1.0))
 
     def numbers(q: np.ndarray, tips: np.ndarray) -> list[list[str]]:
-        rows = zip(tips, q / units, np.asarray(plan.arm.pose(q))[:, :3, 2], strict=True)
+        rows = zip(tips, q[:, : len(units)] / units, np.asarray(plan.arm.pose(q))[:, :3, 2], strict=True)
         return [
             [*(f"{x:.3f}" for x in tip), *(f"{x:.{digits}f}" for x in reading), *(f"{x:.2f}" for x in axis)]
             for tip, reading, axis in rows
@@ -102,6 +106,11 @@ def plan_csv(plan: Planned, angles: Angles = "deg", both_sides: bool = False) ->
     return csv_text(rows)
 
 
+def _chain_labels(arm: Arm, q: np.ndarray) -> list[list[str]]:
+    """What says of which chain of a robot each pose is; nothing without chains."""
+    return [[name] for name in chains_taken(arm, q)] or [[]] * len(q)
+
+
 def _from_both_sides(plan: Planned, q: np.ndarray, tips: np.ndarray) -> Iterator[tuple[int, str, Any, Any, Any]]:
     """Number of the pose, name of the move, readings, tip and directions of approach: every pose twice, with a start
     before it, so that each joint comes to it from one side and then from the other. The sides of the joints are drawn,
@@ -115,13 +124,14 @@ def _from_both_sides(plan: Planned, q: np.ndarray, tips: np.ndarray) -> Iterator
             f"--both-sides moves every joint towards its pose from either side, which takes the tip out of what holds "
             f"it, but {what}; plan for an instrument or camera that sees the arm (--kit)."
         )
-    back, random = np.array(by_joint(plan.arm, _BACK, _BACK_LINEAR)), np.random.default_rng(0)
+    n, random = plan.arm.joints, np.random.default_rng(0)
+    back = np.append(by_joint(plan.arm, _BACK, _BACK_LINEAR), np.zeros(q.shape[1] - n))
     for i, (reading, tip) in enumerate(zip(q, tips, strict=True)):
         sides = random.choice([-1.0, 1.0], len(reading))
         for side in (sides, -sides):
             start = reading - side * back
-            yield i, "approach", start, np.asarray(plan.arm.position(start)), side
-            yield i, "pose", reading, tip, side
+            yield i, "approach", start, np.asarray(plan.arm.position(start)), side[:n]
+            yield i, "pose", reading, tip, side[:n]
 
 
 def _kit_poses(plan: KitPlan) -> tuple[list[list[str]], np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -183,13 +193,22 @@ def plan_manifest(
     entries: dict[str, Any] = {"arm": arm} | ({} if urdf is None else urdf.links)
     what, tables, size = _WHAT[type(plan)], [], []
     if isinstance(plan, Plan):
-        tables += [("socket", {"name": name, "file": f"{name}.csv"}) for name in plan.sockets]
+        for i, name in enumerate(plan.sockets):
+            chains = dict.fromkeys(chains_taken(plan.arm, plan.q[plan.owner == i])) or {"": None}
+            of_chain = ({"chain": chain} if chain else {} for chain in chains)
+            tables += [
+                ("socket", {"name": name, **chain, "file": "_".join([*chain.values(), name]) + ".csv"})
+                for chain in of_chain
+            ]
         for length in plan.lengths:
             value = _length(round(float(length.value), 6), float(length.u))
             tables.append(("length", {"from": length.start, "to": length.end} | value))
     elif isinstance(plan, KitPlan):
         tables += camera_tables([item for item in plan.observations if isinstance(item, Pixels)], targets)
-        tables += [(item.table, _observation(item, plan.arm.joints)) for item in plan.observations]
+        for item in plan.observations:
+            names = chains_taken(plan.arm, np.asarray(item.q)[:1])
+            joints = len(chain_of(plan.arm, names[0]).joints) if names else plan.arm.joints
+            tables.append((item.table, _observation(item, joints) | ({"chain": names[0]} if names else {})))
     else:
         entries, what = entries | {"acceptance": plan.standard}, what.format(PLANNED[plan.standard])
         stated = (

@@ -326,8 +326,8 @@ def one_chain(arm: Arm, what: str) -> Arm:
     if arm.chains:
         names = ", ".join(f"'{name}'" for name, _ in arm.chains)
         raise InputError(
-            f"{what} is for a single chain, but the robot has the chains {names}; choose one (tip= or --tip of a URDF, "
-            "or kinematics.chain_of)."
+            f"{what} is for a single chain, but the robot has the chains {names}; choose one (--chain, or "
+            "tip= or --tip of a URDF, or kinematics.chain_of)."
         )
     return arm
 

@@ -168,6 +168,12 @@ class ForwardPass(NamedTuple):
     members: Float[AnyArray, "m ... 1 N"] | None = None  # of several chains
 
 
+def last_joints(forward: ForwardPass) -> set[int]:
+    """The joints, from 0, whose link ends in a tip: one of each chain."""
+    chains = () if forward.kinds is None else forward.kinds.chains
+    return {joints[-1] for joints in chains} or {len(forward.origin) - 1}
+
+
 def joints_first(values: Any, rank: int) -> Any:
     """``(..., n) -> (n, ..., 1, N)``: the last axis first, ``rank`` batch axes, and one for components before the last.
 

@@ -5,7 +5,7 @@ may be in two frames: a link whose length changes with a joint keeps its ends. D
 under jit too; points are columns, ``(..., 3, N)`` for N configurations, as in `chain`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -15,8 +15,9 @@ from ..core.arguments import Positive, Range, checked
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, in_chunks, namespace, to_numpy
 from ..core.rotations import rotation_matrix
-from .arm import Arm, JointLimits
+from .arm import Arm, JointLimits, with_chains
 from .chain import Vectors, forward_pass, frame_axes, joint_motion
+from .robots import ChainOf, chains_of
 
 _SHORTEST = 1e-6  # mm: shorter links have no capsule
 _NEAR = 2.0  # times the sum of the radii: capsules that less of the arm joins than this are neighbours
@@ -122,7 +123,8 @@ def body_along_links(arm: Arm, radius: float | Sequence[float], tool_radius: flo
     That is the body of an arm whose links are where its table's frames are; of a robot with links beside its axes, its
     URDF's shapes are nearer to the truth (`files.load_cell`). The tool's capsule ends two radii before the tip, so that
     it clears a surface that the tip is in up to a tilt of 60 deg. Capsules that little of the arm joins touch at their
-    joint, and are no pair. `InputError` where a radius is not positive, or not one for each joint.
+    joint, and are no pair; those of different chains of a robot are. `InputError` where a radius is not positive, or
+    not one for each joint.
 
     Args:
         arm: One arm.
@@ -137,6 +139,10 @@ def body_along_links(arm: Arm, radius: float | Sequence[float], tool_radius: flo
     arm, n, base = to_numpy(arm), arm.joints, np.zeros(3)
     shapes = Float[np.ndarray, ""] | Float[np.ndarray, "joints"]
     radii = np.broadcast_to(checked(radius, Annotated[shapes, _RADIUS], "radius", {"joints": n}), (n,))
+    if arm.chains:
+        return body_of_chains(
+            arm, lambda chain: body_along_links(chain.arm, radii[np.array(chain.frames[1:]) - 1].tolist(), tool_radius)
+        )
     tool = float(min(radii[-1] / 4, 8.0) if tool_radius is None else tool_radius)
     checked(tool, Annotated[float, _RADIUS], "tool_radius")
     beta = np.zeros(n) if arm.beta is None else np.asarray(arm.beta)
@@ -164,13 +170,68 @@ def body_along_links(arm: Arm, radius: float | Sequence[float], tool_radius: flo
     return Body(names, start_frame, start, end_frame, end, widths, np.column_stack([first, second])[apart])
 
 
-def capsule_ends(body: Body, arm: Arm, q: Float[AnyArray, "N n"]) -> tuple[Vectors, Vectors]:
-    """Where the capsules' segments begin and end at N configurations, in the base frame, mm."""
+def body_of_chains(robot: Arm, body_of: Callable[[ChainOf], Body]) -> Body:
+    """The body of a robot from that of each chain's arm, ``body_of`` it.
+
+    Links of the same name are one. Capsules that are in no chain together are pairs; others are where they are in every
+    chain that has both.
+    """
+    rows: dict[str, tuple] = {}
+    pairs: dict[tuple[str, str], bool] = {}  # of one chain
+    for chain_name, chain in chains_of(robot).items():
+        body, frames, names = body_of(chain), np.array(chain.frames), []
+        for name in body.names:  # "link a_3" by its row in the table of the robot
+            kind, _, row = name.partition(" ")
+            names.append(
+                f"probe of {chain_name}"
+                if name == "probe"
+                else f"{kind} {chain.names[row]}"
+                if row in chain.names
+                else name
+            )
+        ends = (frames[body.start_frame], body.start, frames[body.end_frame], body.end, body.radius)
+        for name, *row in zip(names, *ends, strict=True):
+            rows.setdefault(name, tuple(row))
+        checked_pairs = set(map(tuple, body.pairs.tolist()))
+        for i, j in zip(*np.triu_indices(len(names), 1), strict=True):
+            pair = (names[i], names[j])
+            pairs[pair] = pairs.get(pair, True) and (i, j) in checked_pairs
+    every, number = list(rows), {name: i for i, name in enumerate(rows)}
+    known = {frozenset(pair) for pair in pairs}
+    chosen = [(number[a], number[b]) for (a, b), is_pair in pairs.items() if is_pair]
+    chosen += [
+        (i, j)
+        for i, j in zip(*np.triu_indices(len(every), 1), strict=True)
+        if frozenset((every[i], every[j])) not in known
+    ]
+    return Body(
+        tuple(every), *map(np.array, zip(*rows.values(), strict=True)), pairs=np.array(chosen, int).reshape(-1, 2)
+    )
+
+
+def _frames(arm: Arm, q: Float[AnyArray, "N columns"]) -> tuple[AnyArray, AnyArray]:
+    """Axes ``(n + 1, 3, 3, N)`` and origins of the base and of the frames after the joints; of a robot, the frames of
+    every chain, whichever a pose is of."""
     forward = forward_pass(arm.geometry, joint_motion(arm.geometry, q))
     xp, (x, y, z) = namespace(forward), frame_axes(forward)
     base = xp.broadcast_to(xp.asarray(np.eye(3))[None, :, :, None], (1, 3, 3, z.shape[-1]))
     axes = xp.concatenate([base, xp.stack([x, y, z], axis=2)])
-    origins = xp.concatenate([xp.zeros_like(forward.origin[:1]), forward.origin])
+    return axes, xp.concatenate([xp.zeros_like(forward.origin[:1]), forward.origin])
+
+
+def capsule_ends(body: Body, arm: Arm, q: Float[AnyArray, "N columns"]) -> tuple[Vectors, Vectors]:
+    """Where the capsules' segments begin and end at N configurations, in the base frame, mm."""
+    if arm.chains:
+        xp, n = namespace(arm, q), arm.joints
+        passes = [
+            _frames(arm, xp.concatenate([q[:, :n], xp.full_like(q[:, n : n + 1], number), q[:, n + 1 :]], axis=1))
+            for number in range(len(arm.chains))
+        ]
+        owner = [next((c for c, (_, joints) in enumerate(arm.chains) if i in joints), 0) for i in range(n + 1)]
+        axes, origins = (xp.stack([passes[c][part][i] for i, c in enumerate(owner)]) for part in (0, 1))
+    else:
+        axes, origins = _frames(arm, q)
+        xp = namespace(axes)
 
     def placed(frame: Int[np.ndarray, " k"], point: Float[np.ndarray, "k 3"]) -> AnyArray:
         columns = (axes[frame][:, :, i] * xp.asarray(point[:, i])[:, None, None] for i in range(3))
@@ -298,7 +359,7 @@ def checked_cell(arm: Arm, cell: Cell, limits: JointLimits) -> Cell:
         if names.count(obstacle.name) > 1:
             raise InputError(f"two obstacles have the name '{obstacle.name}'; give them different names.")
     checked(cell.clearance, Annotated[float, Range(least=0, unit="mm")], "the clearance")
-    q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_SAMPLES, arm.joints))
+    q = with_chains(arm, np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_SAMPLES, arm.joints)))
     names, distances = _distances(cell._replace(unchecked=()), to_numpy(arm), q)
     share, pairs = np.mean(distances < cell.clearance, axis=1), len(cell.body.pairs)
     touching = share >= np.where(np.arange(len(names)) < pairs, _MOSTLY, 1.0)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from ..core.arrays import Numbers
 from .arm import Arm
-from .inverse_kinematics import ARRIVED, FULL_POSE, ReadingsAtPoses, readings_at_poses
+from .inverse_kinematics import ARRIVED, FULL_POSE, ReadingsAtPoses, free_joints, readings_at_poses
 
 _ROUNDS = 20  # each leaves about the relative error of the arm, some thousandths, of what was missing
 
@@ -44,13 +44,13 @@ def corrected_targets(
         >>> print(np.abs(commanded.poses - ur10e.pose(q[None] - 0.001 * np.eye(6)[1])).max() < 1e-6)
         True
     """
-    q, n = np.asarray(q, dtype=float), nominal.joints
-    if oriented or n < FULL_POSE:
+    q, n, own = np.asarray(q, dtype=float), nominal.joints, nominal.beside.own
+    if oriented or free_joints(nominal.geometry, q) < FULL_POSE:
         found = readings_at_poses(calibrated, q, poses, nominal.limits)
-        return CorrectedTargets(np.asarray(nominal.pose(found.q)), found)
+        return CorrectedTargets(np.asarray(nominal.pose(np.hstack([found.q, q[:, n:own]]))), found)
     commanded, moves = np.array(poses), np.full(len(poses), True)
     for _ in range(_ROUNDS):
-        found = readings_at_poses(nominal, q[:, :n], commanded, nominal.limits)
+        found = readings_at_poses(nominal, q[:, :own], commanded, nominal.limits)
         shift = poses[:, :3, 3] - np.asarray(calibrated.position(np.hstack([found.q, q[:, n:]])))
         distance = np.linalg.norm(shift, axis=1)
         moves = np.asarray(found.reached) & (distance > ARRIVED)

@@ -32,9 +32,9 @@ def with_corrections(
     """The same arm with corrections, whose coefficients are 0: it moves as before, and has more parameters.
 
     The functions are evaluated on the frames of this arm, also when its parameters change later. A model leaves out
-    functions that are constant, or combinations of others of the same joint, within the limits of the joints: gravity
-    about a vertical axis, for instance. `InputError` where something in the model is unknown, or numbers do not fit the
-    arm.
+    functions that are constant, or combinations of others of the same joint, within the limits of the joints (gravity
+    about a vertical axis, for instance), and those of fixed joints. `InputError` where something in the model is
+    unknown, or numbers do not fit the arm.
 
     Args:
         arm: The nominal arm; corrections that it has are replaced.
@@ -63,7 +63,8 @@ def with_corrections(
         centres = checked(centre, Float[np.ndarray, "links 3"], "centre", sizes)
         loads = Loads(tuple(masses.tolist()), tuple(map(tuple, centres.tolist())))
     if isinstance(model, str):
-        terms = _determined(plain, terms_of(model, plain.joints, loads), down)
+        moving = [term for term in terms_of(model, plain.joints, loads) if term.joint not in plain.fixed]
+        terms = _determined(plain, moving, down)
     else:
         by_name = {name: term_of(name, plain.joints, loads) for name in checked(model, Iterable[str], "model")}
         for name, term in by_name.items():

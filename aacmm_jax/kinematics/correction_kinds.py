@@ -10,7 +10,7 @@ import operator
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -19,7 +19,7 @@ from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace
 from ..core.rotations import cross
 from .beside import Readings
-from .chain import ForwardPass, frame_axes
+from .chain import ForwardPass, frame_axes, last_joints
 
 REFERENCE_TEMPERATURE = 20.0  # C, by ISO 1
 _HIGHEST = 99  # order of a harmonic
@@ -27,6 +27,7 @@ STANDARD_GRAVITY = 9.80665  # m/s^2, by definition
 _METRE = 1e-3  # m/mm
 KILO = 1e-3  # kN/N: with rad/(kN m), compliances are about as large as errors of angles
 _MASSES = "masses"
+AT_TIP = -1  # in place of a link's number
 
 Rows = Float[AnyArray, "rows ... 1 N"]
 
@@ -305,19 +306,26 @@ class Gravity(AbstractCorrection):
     def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
         xp, moved = namespace(forward), np.array([term.joint - 1 for term in terms])
         weights, points = zip(*[self._pull(term, forward) for term in terms], strict=True)
-        weight = np.array(weights).reshape(-1, *(1,) * forward.tip.ndim)
+        if forward.members is None:
+            weight = np.array(weights).reshape(-1, *(1,) * forward.tip.ndim)
+        else:
+            weight = xp.stack([w + 0.0 * forward.members[0] for w in weights])
         lever = xp.stack(points) - weight * forward.origin_before[moved]
         moments = xp.moveaxis(_METRE * cross(forward.z_before[moved], lever), -2, 1)
         count = moments.shape[0] * moments.shape[1]  # a -1 is undetermined where there are no poses
         return moments.reshape(count, *moments.shape[2:])[..., None, :]
 
-    def _pull(self, term: Term, forward: ForwardPass) -> tuple[float, Float[AnyArray, "... 3 N"]]:
+    def _pull(self, term: Term, forward: ForwardPass) -> tuple[Any, Float[AnyArray, "... 3 N"]]:
         """The weight that pulls at a joint, and the sum of weights times where they are, mm: 1 of a single link, kN."""
-        if term.number:
-            return 1.0, forward.tip if term.number == len(forward.origin) else forward.origin[term.number - 1]
+        if term.number == AT_TIP:
+            return 1.0, forward.tip
+        members: Any = np.ones(len(forward.origin)) if forward.members is None else forward.members
+        if term.number:  # of a robot, nothing where the link is of another chain than the pose
+            j = term.number - 1
+            return members[j], members[j] * (forward.tip if j in last_joints(forward) else forward.origin[j])
         assert term.loads is not None
         # A link's centre of mass is at its origin, and along its axes by the coordinates that are stated.
         links, axes, centre = range(term.joint - 1, len(forward.origin)), frame_axes(forward), term.loads.centre
-        weights = {j: KILO * STANDARD_GRAVITY * term.loads.mass[j] for j in links}
+        weights = {j: KILO * STANDARD_GRAVITY * term.loads.mass[j] * members[j] for j in links}
         pulls = [weights[j] * (forward.origin[j] + sum(centre[j][k] * axes[k][j] for k in range(3))) for j in links]
         return sum(weights.values()), functools.reduce(operator.add, pulls)

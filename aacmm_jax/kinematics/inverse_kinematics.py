@@ -127,6 +127,11 @@ def solve_to_targets(
     return q[:, 0].T, xp.linalg.norm(targets.T - tip, axis=0)
 
 
+def free_joints(geometry: Geometry, q: Float[AnyArray, "... columns"]) -> int:
+    """How many joints an arm moves its tip with; of a robot, the chain that has fewest, of those in these poses."""
+    return geometry.alpha.shape[-1] if geometry.kinds is None else geometry.kinds.fewest(q)
+
+
 def least_norm_inverse(geometry: Geometry, q: Float[AnyArray, "N n"]) -> Float[AnyArray, "n 3 N"]:
     """Least change of every joint per mm that the tip moves along each axis: the pseudo-inverse of the Jacobian, with
     the readings in their units (`JointKinds.units`)."""
@@ -314,7 +319,7 @@ def readings_at_poses(
         )
     allowed = np.tile([-np.inf, np.inf], (n, 1))
     if limits is not None:
-        allowed = np.asarray(checked_limits(limits, n, arm.prismatic))
+        allowed = np.asarray(checked_limits(limits, n, arm.prismatic, arm.fixed))
     shape, geometry, count = q.shape[:-1], arm.geometry, math.prod(q.shape[:-1])
     xp, columns = namespace(geometry, q, poses), q.shape[-1]
 
@@ -324,7 +329,7 @@ def readings_at_poses(
     both = xp.concatenate([q.reshape(count, columns), poses.reshape(count, 16)], axis=1)
     solution = in_chunks(solved, both, ROWS) if xp is np else solved(both)
     readings, distance, angle = solution[:, :n], solution[:, -2], solution[:, -1]
-    reached = (distance <= ARRIVED) & ((angle <= _ALIGNED) | (n < FULL_POSE))
+    reached = (distance <= ARRIVED) & ((angle <= _ALIGNED) | (free_joints(geometry, q) < FULL_POSE))
     return ReadingsAtPoses(readings.reshape(*shape, n), *(x.reshape(shape) for x in (distance, angle, reached)))
 
 
@@ -333,7 +338,7 @@ def _solve_to_poses(
 ) -> Float[AnyArray, "c others"]:
     """Readings by damped least-norm steps to the poses, and the distance (mm) and angle (rad) that remain."""
     xp, n = namespace(geometry, q, poses), len(limits)
-    whole = n >= FULL_POSE
+    whole = free_joints(geometry, q.T) >= FULL_POSE
     low, high, units = limits[:, :1], limits[:, 1:], reading_units(geometry)[:, None]
 
     def step(q: Any, wanted: Any) -> tuple[Any, Any]:
@@ -398,7 +403,7 @@ def least_motion(arm: Arm, q: Float[np.ndarray, "N n"]) -> Float[np.ndarray, " N
     geometry = to_numpy(arm.geometry)
     forward = forward_pass(geometry, joint_motion(geometry, q))
     columns = np.asarray(reading_columns(forward))
-    if arm.joints >= FULL_POSE:
+    if free_joints(geometry, q) >= FULL_POSE:
         columns = np.concatenate([columns, _LEVER * np.asarray(reading_rotations(forward))], axis=1)
     columns = columns * reading_units(geometry)[:, None, None]
     return np.linalg.svd(columns.transpose(2, 1, 0), compute_uv=False)[:, -1]

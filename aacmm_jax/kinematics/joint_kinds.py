@@ -51,6 +51,15 @@ class JointKinds:
             float
         )
 
+    def fewest(self, q: Any) -> int:
+        """The smallest number of joints with a reading of their own in a chain: of readings ``(..., columns)`` that are
+        known, one that these poses are of."""
+        if not self.chains:
+            return int(self.read.sum())
+        counts = self.members[:, : len(self.read)] @ self.read
+        known = isinstance(q, np.ndarray) and q.size
+        return int(counts[np.unique(q[..., len(self.read)].astype(int))].min() if known else counts.min())
+
     @cached_property
     def members(self) -> Float[np.ndarray, "c m"]:
         """1 where a joint, and after the joints a coordinate of the tips, is of a chain."""

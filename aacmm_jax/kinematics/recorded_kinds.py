@@ -9,8 +9,9 @@ from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace
 from ..core.rotations import cross
 from .beside import Readings
-from .chain import ForwardPass
+from .chain import ForwardPass, last_joints
 from .correction_kinds import (
+    AT_TIP,
     KILO,
     REFERENCE_TEMPERATURE,
     STANDARD_GRAVITY,
@@ -22,6 +23,7 @@ from .correction_kinds import (
     Term,
 )
 
+HANGS = "hang"  # the word of coefficients of play by gravity
 _BALANCED = 0.1  # part of a moment, below which gravity does not decide on which side of its play a joint rests
 
 
@@ -37,7 +39,7 @@ class Backlash(AbstractCorrection):
     """
 
     model = "backlash"
-    words = ("play", "hang")
+    words = ("play", HANGS)
     description = "backlash of joints"
     unit = "rad"
     usual_size = 1e-3
@@ -49,13 +51,13 @@ class Backlash(AbstractCorrection):
     def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
         if option not in ("", "gravity"):
             raise InputError(f"backlash={option} is unknown; write backlash, or backlash=gravity.")
-        return tuple(Term(self, "hang" if option else "play", 0, joint) for joint in range(1, joints + 1))
+        return tuple(Term(self, HANGS if option else "play", 0, joint) for joint in range(1, joints + 1))
 
     def option_of(self, terms: Sequence[Term]) -> str:
-        return "gravity" if terms[0].word == "hang" else ""
+        return "gravity" if terms[0].word == HANGS else ""
 
     def column_of(self, term: Term) -> str:
-        return "" if term.word == "hang" else self.column
+        return "" if term.word == HANGS else self.column
 
     def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
         rows = [
@@ -70,10 +72,13 @@ class Backlash(AbstractCorrection):
 
     def _by_gravity(self, joint: int, q: Readings, forward: ForwardPass) -> Float[AnyArray, "... 1 N"]:
         xp = namespace(forward)
-        points = xp.stack([*forward.origin[joint:-1], forward.tip])
+        last, n = last_joints(forward), len(forward.origin)
+        points = xp.stack([forward.tip if j in last else forward.origin[j] for j in range(joint, n)])
         levers = points - forward.origin_before[joint]
+        levers = levers if forward.members is None else levers * forward.members[joint:n]
         moment = -cross(forward.z_before[joint], xp.sum(levers, axis=0))[..., 2:, :]
         size = xp.sum(xp.sqrt(xp.sum(levers**2, axis=-2, keepdims=True)), axis=0)
+        size = xp.where(size > 0, size, 1.0)  # 0 of a joint of another chain
         return 0.5 * xp.clip(moment / (_BALANCED * size), -1.0, 1.0)
 
 
@@ -117,7 +122,7 @@ class Load(AbstractCorrection):
     )
 
     def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
-        at_tip = [term._replace(number=len(forward.origin)) for term in terms]
+        at_tip = [term._replace(number=AT_TIP) for term in terms]
         moments = Gravity().values(at_tip, q, forward)
         return 0.0 * moments if q.load is None else KILO * STANDARD_GRAVITY * q.load * moments
 

@@ -21,8 +21,11 @@ from jaxtyping import Float
 from ..core.arrays import Numbers, as_floats
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import to_numpy
-from .arm import Arm, joint_limits, parameter_names, probe_names, value_of
+from .arm import Arm, arm_of, joint_limits, parameter_names, probe_names, value_of, without_corrections
 from .axes_to_dh import Transform, dh_link, rotation
+from .chain import Corrections, KnownFunctions
+from .correction_kinds import Term
+from .recorded_kinds import HANGS
 
 _ROW = ("theta", "d", "a", "alpha", "beta")
 _STEP = 1e-4  # mm and rad, of derivatives
@@ -63,6 +66,12 @@ class ChainOf(NamedTuple):
         whole[:, np.array(self.joints) - 1] = values
         return whole
 
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """The frame of the robot that each frame of the arm is: of its base, and after each of its joints."""
+        after = (int(self.names[f"a_{i}"].removeprefix("a_")) for i in range(1, self.arm.joints + 1))
+        return ((0, *self.mount)[-1], *after)
+
     def of_robot(self, q: Numbers) -> Float[np.ndarray, "N n"]:
         """The readings of the chain among those of the robot."""
         return np.asarray(q)[..., np.array(self.joints) - 1]
@@ -71,8 +80,9 @@ class ChainOf(NamedTuple):
 def chain_of(robot: Arm, name: str) -> ChainOf:
     """A chain of a robot as an arm of its own, which is exact.
 
-    Links that are fixed joints of the robot are part of the joint before them. `InputError` for a chain that does not
-    exist, and for joint corrections, which belong to the whole robot.
+    Links that are fixed joints of the robot are part of the joint before them. Joint corrections of the chain are those
+    of the arm, gravity in its own base frame. `InputError` for a chain that does not exist, or that is no arm of its
+    own: where a joint follows one of another chain, or links of known masses are part of others.
 
     Args:
         robot: An arm with chains.
@@ -88,8 +98,6 @@ def chain_of(robot: Arm, name: str) -> ChainOf:
     numbers = [chain for chain, _ in robot.chains]
     if name not in numbers:
         raise InputError(f"the robot has no chain '{name}'{nearest(str(name), numbers)}")
-    if robot.corrections is not None:
-        raise InputError("a chain of a robot with joint corrections is not an arm of its own; remove the corrections.")
     number, (_, joints) = numbers.index(name), robot.chains[numbers.index(name)]
     rows = _rows_of(robot)
     start = next(place for place, joint in enumerate(joints) if joint not in robot.fixed)
@@ -122,16 +130,72 @@ def chain_of(robot: Arm, name: str) -> ChainOf:
         fixed=[place[joint] for joint in moving if joint in robot.fixed],
         mimic=[(place[joint], place[source], factor, zero) for joint, source, factor, zero in following],
     )
+    arm = _with_corrections(robot, arm, name, number, moving, owner, base)
     kinds = _ROW if robot.beta is not None else _ROW[:-1]
     names = {f"{kind}_{i}": f"{kind}_{joint}" for i, joint in enumerate(owner, start=1) for kind in kinds}
     probes = probe_names(len(robot.chains))[3 * number : 3 * number + 3]
     names |= dict(zip(probe_names(1), probes, strict=True))
+    names |= {own: of_robot for own, of_robot in zip(_coefficients(arm), _kept(robot, moving, owner), strict=True)}
     return ChainOf(arm, base, number, tuple(moving), tuple(joints[:start]), names, robot.joints)
 
 
+def _kept(robot: Arm, moving: Sequence[int], owner: Sequence[int]) -> dict[str, Term]:
+    """The corrections of a robot that are those of a chain, by their names, as terms of the chain's arm."""
+    place = {0: 0} | {joint: i for i, joint in enumerate(moving, start=1)}
+    kept = {}
+    for term in () if robot.corrections is None else robot.corrections.functions.terms:
+        of_link, number = term.kind.rows == 3 and term.number > 0, term.number
+        if of_link:
+            number = owner.index(number) + 1 if number in owner else 0
+        elif term.kind.of_other_reading:
+            number = place.get(number, 0)
+        if term.joint in place and (number or not term.number):
+            kept[term.name] = term._replace(number=number, joint=place[term.joint])
+    return kept
+
+
+def _coefficients(arm: Arm) -> tuple[str, ...]:
+    return () if arm.corrections is None else arm.corrections.functions.names
+
+
+def _with_corrections(
+    robot: Arm, arm: Arm, name: str, number: int, moving: list[int], owner: list[int], base: Transform
+) -> Arm:
+    """The arm of a chain with the corrections of the robot that are its own."""
+    kept = _kept(robot, moving, owner)
+    if robot.corrections is None or not kept:
+        return arm
+    loads = next((term.loads for term in kept.values() if term.loads is not None), None)
+    if loads is not None:
+        raise InputError(
+            f"joint corrections of chain '{name}' use the masses of all links of the robot, so the chain is not an arm "
+            "of its own; remove these corrections."
+        )
+    if any(term.word == HANGS for term in kept.values()) and abs(base[2, 2] - 1) > _SAME:
+        raise InputError(
+            f"the base of chain '{name}' is tilted, but backlash=gravity is for a base that stands upright, so the "
+            "chain is not an arm of its own; remove these corrections."
+        )
+    assert robot.coefficients is not None
+    places = [robot.corrections.functions.names.index(of_robot) for of_robot in kept]
+    nominal = chain_of(arm_of(robot.corrections.nominal), str(number + 1)).arm.geometry
+    return arm.replace(
+        corrections=Corrections(KnownFunctions(tuple(kept.values())), nominal),
+        coefficients=np.asarray(robot.coefficients)[places],
+        gravity=base[:3, :3].T @ np.asarray(robot.gravity),
+        **dict.fromkeys(robot.recorded, True),
+    )
+
+
+def chains_taken(robot: Arm, q: Float[np.ndarray, "N columns"]) -> tuple[str, ...]:
+    """The names of the chains that poses are of; empty for an arm without chains."""
+    return tuple(robot.chains[int(number)][0] for number in q[:, robot.joints]) if robot.chains else ()
+
+
 def chains_of(robot: Arm) -> dict[str, ChainOf]:
-    """All chains of a robot by name."""
-    return {name: chain_of(robot, name) for name, _ in robot.chains}
+    """All chains of a robot by name, without joint corrections."""
+    plain = without_corrections(robot) if robot.corrections is not None else robot
+    return {name: chain_of(plain, name) for name, _ in robot.chains}
 
 
 def _rows_of(arm: Arm) -> Float[np.ndarray, "n 5"]:
@@ -312,8 +376,9 @@ def _product(rows: Float[np.ndarray, "n 5"], joints: Sequence[int]) -> Transform
 
 def with_bases(robot: Arm, bases: Mapping[str, Transform]) -> Arm:
     """The robot with the bases of some chains elsewhere, in the base of the robot."""
+    chains = chains_of(robot)
     for name, base in bases.items():
-        chain = chain_of(robot, name)
+        chain = chains[name] if name in chains else chain_of(robot, name)
         if not chain.mount:
             raise InputError(f"chain '{name}' stands on the base of the robot, which does not move.")
         rows = zip(chain.mount, mount_rows(base), strict=True)

@@ -125,25 +125,39 @@ def _extreme_distance(arm: Arm, *, farthest: bool) -> Reach:
 
 
 def skeleton(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m c 3"]:
-    """Corners of the arm, mm: the base, the end of each joint's offset and of its link, and the tip (c = 2 n + 2)."""
+    """Corners of the arm, mm: the base, the end of each joint's offset and of its link, and the tip (c = 2 n + 2); of a
+    robot, those of the chain of each pose, where joints of other chains add nothing."""
+    chains = [chain for chain in chains_of(arm).values() if chain.mount]
 
     def lines(rows: np.ndarray) -> np.ndarray:
         geometry, motion = to_numpy((arm.geometry, joint_motion(arm.geometry, rows)))
         forward = forward_pass(geometry, motion)
         along = geometry.d[:, None, None] + (0.0 if motion.slide is None else motion.slide)
+        along = along if motion.members is None else along * motion.members[: arm.joints]
         offset = forward.origin_before + along * forward.z_before
         both = np.stack([offset, np.broadcast_to(forward.origin, offset.shape)], axis=1).reshape(2 * arm.joints, 3, -1)
-        return np.concatenate([np.zeros_like(both[:1]), both, forward.tip[None]]).transpose(2, 0, 1)
+        corners = np.concatenate([np.zeros_like(both[:1]), both, forward.tip[None]]).transpose(2, 0, 1)
+        for chain in chains:  # they begin at their own base
+            of_chain = rows[:, arm.joints] == chain.number
+            first = 2 * max(chain.mount)
+            corners[of_chain, :first] = corners[of_chain, first : first + 1]
+        return corners
 
     return in_chunks(lines, np.asarray(q))
 
 
 def lowest_point(arm: Arm, q: Configurations) -> Float[np.ndarray, " c"]:
-    """Height of the lowest joint or tip in the base frame, mm, without the base itself, for each configuration."""
+    """Height of the lowest joint or tip in the base frame, mm, without the base itself, for each configuration; of a
+    robot, of the chain of each."""
+    mounts = [joint - 1 for chain in chains_of(arm).values() for joint in chain.mount]
 
     def lowest(rows: np.ndarray) -> np.ndarray:
         forward = forward_pass(*to_numpy((arm.geometry, joint_motion(arm.geometry, rows))))
-        return np.minimum(np.min(forward.origin[:, 2], axis=0), forward.tip[2])
+        heights = np.array(forward.origin[:, 2])
+        if forward.members is not None:
+            heights[forward.members[: arm.joints, 0] == 0] = np.inf
+            heights[mounts] = np.inf
+        return np.minimum(np.min(heights, axis=0), forward.tip[2])
 
     return in_chunks(lowest, q)
 
@@ -224,7 +238,7 @@ def into_cones(
     """
     geometry = to_numpy(arm.geometry)
     low, high = limits[:, :1], limits[:, 1:]
-    units = reading_units(geometry)[:, None]  # steps are in what counts alike: 1 rad, or 1 m
+    units, columns = reading_units(geometry)[:, None], q.shape[1]  # steps are in what counts alike: 1 rad, or 1 m
 
     def tool_of(forward: ForwardPass) -> np.ndarray:
         x, y, z = forward.frame
@@ -248,11 +262,12 @@ def into_cones(
             free = row - np.sum(inverse * np.einsum("jn,jcn->cn", row, columns)[None], axis=1)
             size = np.sum(free * row, axis=0)
             change = change + free * ((turn - np.sum(row * change, axis=0)) / (size + 1e-2 * turn**2 + 1e-6))
-        new = np.clip(q + units * np.clip(change, -LARGEST_STEP, LARGEST_STEP), low, high)
+        joints = np.clip(q[: arm.joints] + units * np.clip(change, -LARGEST_STEP, LARGEST_STEP), low, high)
+        new = np.concatenate([joints, q[arm.joints :]])
         return new, np.any(np.abs(gap) > EXACT, axis=0) | outside
 
     def moved(rows: np.ndarray) -> np.ndarray:
-        start, targets, normals, half_angles = np.split(rows.T, [arm.joints, arm.joints + 3, arm.joints + 6])
+        start, targets, normals, half_angles = np.split(rows.T, [columns, columns + 3, columns + 6])
         q = repeated(step, start, [targets, normals, np.maximum(half_angles - _INSIDE, 0.0)[0]], steps)
         forward = forward_pass(geometry, joint_motion(geometry, q.T))
         arrived = np.linalg.norm(targets - forward.tip, axis=0) <= ARRIVED
@@ -273,10 +288,25 @@ class SearchRegion(NamedTuple):
     random: np.random.Generator
     cones: Cones | None = None  # of approach to each socket; None where the tool may have any direction
     cell: Cell | None = None  # what the arm may not touch
+    chains: tuple[int, ...] = ()  # of a robot: the numbers of those that take poses, in turn
+    rest: Float[np.ndarray, " n"] | None = None  # readings of a robot's joints while another chain takes a pose
 
     def draw(self, count: int) -> Configurations:
-        """Random configurations within the limits."""
-        return self.random.uniform(self.limits[:, 0], self.limits[:, 1], (count, self.arm.joints))
+        """Random configurations within the limits; of a robot, of one chain each, the joints of others at rest."""
+        q = self.random.uniform(self.limits[:, 0], self.limits[:, 1], (count, self.arm.joints))
+        if self.rest is None or not self.arm.chains:
+            return q
+        q = np.column_stack([q, np.resize(np.array(self.chains), count)])
+        q[:, : self.arm.joints] = np.where(self.units(q)[:, :-1] > 0, q[:, : self.arm.joints], self.rest)
+        return q
+
+    def units(self, q: Configurations) -> Configurations:
+        """What a step of each column of these configurations counts: 1 rad or 1 m; 0 of joints of other chains."""
+        units, kinds = reading_units(self.arm.geometry), self.arm.geometry.kinds
+        if kinds is None or not kinds.chains:
+            return np.tile(units, (len(q), 1))
+        chain = q[:, self.arm.joints].astype(int)
+        return np.column_stack([units * kinds.members[chain, : self.arm.joints], np.zeros(len(q))])
 
 
 def search_region(
@@ -291,15 +321,22 @@ def search_region(
     """The region ``margin`` (rad, or m of prismatic joints) inside the joint limits (default: the arm's own), ``above``
     (mm) the table, within the cones of approach and clear of the cell's obstacles."""
     checked(seed, Annotated[int, Range(least=0)], "seed")
-    allowed, margins = joint_limits(arm, limits), margin * reading_units(arm.geometry)
-    if not (math.isfinite(margin) and margin >= 0 and np.all(margins < (allowed[:, 1] - allowed[:, 0]) / 2)):
+    allowed, kinds = joint_limits(arm, limits), arm.geometry.kinds
+    moving = np.ones(arm.joints) if kinds is None else kinds.read
+    margins = margin * reading_units(arm.geometry) * moving
+    room = (allowed[:, 1] - allowed[:, 0])[moving > 0] / 2
+    if not (math.isfinite(margin) and margin >= 0 and np.all(margins[moving > 0] < room)):
         raise InputError(
             f"a margin of {math.degrees(margin):g} deg leaves no range of motion between the limits of a joint; give a "
             "smaller margin."
         )
     inner = allowed + margins[:, None] * np.array([1.0, -1.0])
     cell = None if cell is None else checked_cell(arm, cell, inner)
-    return SearchRegion(arm, inner, above, np.random.default_rng(seed), cones, cell)
+    middle = inner.mean(axis=1)
+    rest = np.where((inner[:, 0] <= 0) & (inner[:, 1] >= 0), 0.0, middle)
+    return SearchRegion(
+        arm, inner, above, np.random.default_rng(seed), cones, cell, tuple(range(len(arm.chains))), rest
+    )
 
 
 def reached(

@@ -1,19 +1,55 @@
-"""What a capture shows so far, and what to measure next."""
+"""What a capture shows so far: the calibration after every pose, wrong poses, and which pose to take next.
+
+The arm is calibrated from all poses by the engine (`pipeline.calibrate`), with the noise that is usual for it and with
+the bounds of its parameters as a prior, so that the first pose counts already. Everything else is linear algebra with
+the rows at that solution: with whitened residuals e and derivatives X of a pose and the covariance C of all unknowns, H
+= X C X^T, e of a pose that was used has the covariance I - H, and d = e^T (I - H)^-1 e is the square of its deletion
+residual (Cook and Weisberg 1982), which an F test compares with all others. A pose that is left out has I + H.
+"""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
-from ..kinematics.arm import Arm, joint_limits
-from ..kinematics.inverse_kinematics import project_to_targets
-from .places import Setup, TakenPose
+from ..calibration.evaluation import fit_geometry
+from ..calibration.scale_anchor import fixes_scale
+from ..calibration.task import without_lengths
+from ..core.distributions import f_tail, student_quantile
+from ..core.numpy_or_jax import to_numpy
+from ..data.capture import Capture
+from ..kinematics.arm import Arm
+from ..kinematics.chain import reading_units
+from ..kinematics.parameters import Bounds, Parameters
+from ..kinematics.priors import Prior, default_prior
+from ..kinematics.workspace import reached
+from ..model.observed import Observed
+from ..pipeline.single import calibrate, identify
+from ..planning.designs import Candidates
+from ..planning.kit_placement import rows_by_pose, rows_of_relations
+from ..planning.motion import approaches, joint_weights, move_contacts
+from ..planning.placement import LEAST_POSES
+from ..planning.problem import PRIOR, PlanOptions
+from ..uncertainty.coverage import LEVEL
+from ..uncertainty.linearisation import Linearisation
+from .candidates import Search
+from .limits import gained, progress
+from .places import Setup, TakenPose, capture_of
+
+_FREEDOM = 4.0  # degrees of freedom that the usual noise counts
+_WRONG, _RIGHT = 1e-3, 0.05  # probability, times the number of poses, of an outlier; probability of one that fits again
+_NEWER = 0.8  # of the largest ratio, from which the newest pose is the outlier
+_OPEN = 1e-3  # eigenvalue of I - H below which nothing else shows an error of the pose
+_LEAST_U = 1e-4  # mm: smallest standard uncertainty of what is certified
+_ROUNDS = 3  # of leaving out poses
+_OTHER_PLACE = 1.0  # rad: what a change of place counts besides its motion
+_MOVES = 6  # that are checked for collisions
 
 
 class PoseResidual(NamedTuple):
-    """The tip of a pose, its residual, mm, the size that the residual is expected to have, and whether it is an
-    outlier."""
+    """The tip of a pose, its residual, mm, the size that the residual is expected to have (NaN where nothing else shows
+    it), and whether it is an outlier, which the calibration leaves out."""
 
     tip: Float[np.ndarray, " 3"]
     residual: Float[np.ndarray, " 3"]
@@ -22,7 +58,8 @@ class PoseResidual(NamedTuple):
 
 
 class Guidance(NamedTuple):
-    """The calibration of the poses so far. U is the expanded uncertainty (95 %) of a length, mm."""
+    """The calibration of the poses so far. U is the expanded uncertainty (95 %) of a length, the largest over the
+    volume, mm."""
 
     arm: Arm  # as calibrated so far
     poses: Mapping[int, PoseResidual]  # by number
@@ -32,42 +69,307 @@ class Guidance(NamedTuple):
     limits: str  # what limits U, as a sentence
     stop: bool  # whether the target is met
     sentences: tuple[str, ...]  # findings
+    again: TakenPose | None  # the newest pose, where it is an outlier
+    last: str  # the place of the newest pose
+    known: Candidates  # the candidates and what is known so far
+    ahead: tuple[int, ...]  # the candidates that are planned
 
 
 class NextPose(NamedTuple):
-    """A pose to take: its place, the readings to go to, why, and how far the joints move, rad."""
+    """A pose to take: its place, the readings to go to, why, how far the joints move, rad, and the readings of its
+    approach point, if it has one."""
 
     place: str
     q: Float[np.ndarray, " n"]
     why: str
     distance: float
+    approach: Float[np.ndarray, " n"] | None = None
 
 
-def calibrated(setup: Setup, poses: Sequence[TakenPose], target: float | None = None) -> Guidance | None:
-    """The calibration of the poses so far; None where they are too few."""
-    return None
+class Guide:
+    """Guides one capture; called after every pose, in one thread.
+
+    Args:
+        setup: The arm and the places.
+        target: U of a length that is asked for, mm; None: no end.
+        options: As for `Search`.
+
+    Raises:
+        InputError: As `Search` does.
+    """
+
+    def __init__(self, setup: Setup, target: float | None = None, options: PlanOptions | None = None):
+        self.setup, self.target = setup, target
+        self.search = Search(setup, options)
+        self._wrong: frozenset[int] = frozenset()
+        self._newest, self._start, self._ahead = 0, None, list(self.search.planned)
+        arm, given = self.search.problem.arm, setup.specification
+        usual = {} if arm.corrections is None else {k: float(v) for k, v in default_prior(arm).sd.items()}
+        widths = usual | {"lengths": given.length, "angles": given.angle} | dict(given.override)
+        self._prior = Prior({name: width for name, width in widths.items() if width > 0})
+        self._weights = joint_weights(arm) / np.broadcast_to(reading_units(arm.geometry), (arm.joints,))
+
+    def calibrated(self, poses: Sequence[TakenPose]) -> Guidance | None:
+        """The calibration of the poses so far; None where there are none.
+
+        Raises:
+            InputError: A pose lacks what was to be measured, or the solve is impossible.
+        """
+        poses = [pose for pose in poses if not pose.excluded]
+        if not poses:
+            self._ahead = list(self.search.planned)
+            return None
+        numbers = {pose.number for pose in poses}
+        wrong, newest = self._wrong & numbers, max(numbers)
+        for _ in range(_ROUNDS):
+            solution = self._solved(poses, wrong)
+            outliers = solution.outliers(newest)
+            if outliers == wrong:
+                break
+            wrong = outliers
+        else:
+            solution = self._solved(poses, wrong)
+        self._wrong = wrong
+        return self._guidance(poses, solution)
+
+    def next_pose(
+        self, guidance: Guidance | None, q: Float[np.ndarray, " n"] | None, place: str | None = None
+    ) -> NextPose | None:
+        """The pose to take next: of those that are planned the nearest to the present readings ``q`` that the joints
+        can move to without a collision; in ``place``, where that is given. An outlier is taken again first."""
+        again = None if guidance is None else guidance.again
+        if again is not None and place in (None, again.place) and guidance is not None:
+            away = float(np.linalg.norm(guidance.poses[again.number].residual))
+            return self._proposed(
+                again.place, again.q, f"Pose {again.number} is {away:.2g} mm off: take it again.", q, None
+            )
+        pool = self.search.pool()
+        known, ahead = (pool.candidates, self.search.planned) if guidance is None else (guidance.known, guidance.ahead)
+        here = place if place is not None else None if guidance is None else guidance.last
+        index = next((i for i, at in enumerate(self.setup.places) if at.name == here), -1)
+        rows = np.array(ahead, dtype=int)
+        if place is not None:
+            rows = rows[known.owner[rows] == index]
+            if not len(rows):
+                inside = np.flatnonzero(known.owner == index)
+                if not len(inside):
+                    return None
+                part = known._replace(rows=known.rows[inside], owner=known.owner[inside])
+                rows = inside[self.search.chosen(part, 1)]
+        best, distance = self._nearest(pool.q, known, rows, q, index)
+        why = gained(self.search.problem, known, best)
+        name = self.setup.places[int(known.owner[best])].name
+        return self._proposed(name, pool.q[best], why, q, guidance)._replace(distance=distance)
+
+    def _nearest(
+        self, q: np.ndarray, known: Candidates, rows: np.ndarray, now: np.ndarray | None, here: int
+    ) -> tuple[int, float]:
+        """The candidate with the shortest motion, in another place only where that is much shorter."""
+        if now is None:
+            return int(rows[0]), 0.0
+        away = np.abs((q[rows] - now) * self._weights).sum(axis=1)
+        order = np.argsort(away + _OTHER_PLACE * (known.owner[rows] != here))
+        first = rows[order[:_MOVES]]
+        contacts = move_contacts(self.search.problem.region, np.tile(now, (len(first), 1)), q[first])
+        free = next((i for i, contact in enumerate(contacts) if contact is None), 0)
+        return int(first[free]), float(away[order[free]])
+
+    def _proposed(
+        self, place: str, q: np.ndarray, why: str, now: np.ndarray | None, guidance: Guidance | None
+    ) -> NextPose:
+        """A pose with its tip where the place is, by the arm as it is calibrated so far."""
+        region, approach = self.search.problem.region, None
+        thing = self.search.things[self.setup.place(place).thing.name]
+        if guidance is not None and place in guidance.positions:
+            seat = thing.seat(region._replace(arm=guidance.arm))
+            there, good = reached(seat, q[None], guidance.positions[place][None])
+            q = there[0] if good[0] else q
+        retract, seat = self.search.problem.options.retract, thing.seat(region)
+        if retract and thing.item.has_cone and seat.cones is not None:
+            above, good = approaches(seat, q[None], seat.cones.normals[:1], retract)
+            approach = above[0] if good[0] else None
+        distance = 0.0 if now is None else float(np.abs((q - now) * self._weights).sum())
+        return NextPose(place, q, why, distance, approach)
+
+    def _solved(self, poses: Sequence[TakenPose], wrong: frozenset[int]) -> "_Solution":
+        """The calibration without wrong poses, and the rows of all poses at it."""
+        problem = self.search.problem
+        capture, _ = capture_of(self.setup, [pose for pose in poses if pose.number not in wrong] or poses)
+        endless = np.full(len(problem.space.names), np.inf)
+        bounds, options = Bounds(problem.space, -endless, endless), {"start": self._start, "noise": problem.noise}
+        options |= {"prior": self._prior, "replace_noise": False}
+        if capture.lengths or fixes_scale(capture):
+            result = calibrate(problem.arm, capture, bounds, **options, shared_errors=False, undetermined="ignore")
+        else:  # the prior holds the scale
+            result = identify(problem.arm, capture, bounds, **options, hold=None)
+        vector = np.asarray(result.parameters)
+        self._start = vector if np.all(np.isfinite(vector)) else None
+        whole, numbers = capture_of(self.setup, poses)
+        arm = to_numpy(result.arm)
+        observed = to_numpy(Observed.of(whole, arm))
+        geometry = {name: np.asarray(values) for name, values in result.observed.geometry.items()}
+        if any(name not in geometry for name in observed.blocks):
+            alone = to_numpy(Observed.of(without_lengths(whole), arm))
+            kept = {name: values for name, values in geometry.items() if name in alone.blocks}
+            geometry = alone.split(np.asarray(fit_geometry(arm, alone, kept, problem.noise).geometry))
+        z = np.concatenate([vector, *(geometry[name] for name in observed.blocks)])
+        linear = Linearisation.at(
+            observed, Parameters(arm, problem.space.names), z, noise=problem.noise, least=_LEAST_U
+        )
+        return _Solution.of(self.search, self._widths(), whole, linear, np.array(numbers), wrong)
+
+    def _widths(self) -> Float[np.ndarray, " p"]:
+        """Standard deviations of the prior in natural steps."""
+        space = self.search.problem.space
+        prior = self._prior.of(space.names, np.asarray(space.vector()))
+        sd = np.full(len(space.names), np.inf)
+        if prior is not None:
+            sd[prior.index] = np.asarray(prior.sd)[prior.index]
+        return sd / np.asarray(space.scale)
+
+    def _guidance(self, poses: Sequence[TakenPose], solution: "_Solution") -> Guidance:
+        newest = max(poses, key=lambda pose: pose.number)
+        self._drop_taken(newest, solution)
+        used = [pose for pose in poses if pose.number not in self._wrong and pose.session == newest.session]
+        counts = np.array([sum(pose.place == place.name for pose in used) for place in self.setup.places])
+        found = progress(
+            self.search, solution.known, solution.taken, solution.scale, self._ahead,
+            np.maximum(LEAST_POSES - counts, 0), self.target,
+        )  # fmt: skip
+        self._ahead = found.ahead
+        by_number = solution.residuals()
+        positions: dict[str, Any] = {}
+        for place in self.setup.places:
+            own = [pose for pose in used if pose.place == place.name]
+            if own and place.position is not None:
+                positions[place.name] = np.mean([by_number[pose.number].tip for pose in own], axis=0)
+        again = newest if newest.number in self._wrong else None
+        return Guidance(
+            arm=solution.linear.space.base, poses=by_number, positions=positions, u_length=found.u,
+            u_after_ten=found.u_after_ten, limits=found.limits, stop=found.met,
+            sentences=(*self._sentences(poses, by_number), *self.search.unreached.values()), again=again,
+            last=newest.place, known=solution.known, ahead=tuple(found.ahead),
+        )  # fmt: skip
+
+    def _sentences(self, poses: Sequence[TakenPose], found: Mapping[int, PoseResidual]) -> list[str]:
+        wrong = [pose for pose in poses if pose.number in self._wrong]
+        return [
+            f"Pose {pose.number} in {pose.place} is {np.linalg.norm(found[pose.number].residual):.2g} mm off and is "
+            f"left out; {found[pose.number].expected:.1g} mm is expected."
+            for pose in wrong
+        ]
+
+    def _drop_taken(self, newest: TakenPose, solution: "_Solution") -> None:
+        """Take from the plan the pose that was taken, or else the one that is worth least."""
+        if newest.number <= self._newest or newest.number in self._wrong or not self._ahead:
+            self._newest = max(newest.number, self._newest)
+            return
+        self._newest = newest.number
+        pool, ahead = self.search.pool(), np.array(self._ahead)
+        q = newest.q[: pool.q.shape[1]]
+        away = np.abs((pool.q[ahead] - q) * self._weights).sum(axis=1)
+        elsewhere = np.array([self.setup.places[i].name != newest.place for i in pool.place[ahead]])
+        self._ahead.pop(int(np.argmin(away + 1e3 * elsewhere)))
 
 
-def next_pose(
-    setup: Setup,
-    poses: Sequence[TakenPose],
-    guidance: Guidance | None,
-    q: Float[np.ndarray, " n"] | None,
-    place: str | None = None,
-) -> NextPose | None:
-    """The pose to take next, near the present readings ``q``; in ``place``, where that is given."""
-    arm = setup.specification.arm
-    limits = np.asarray(joint_limits(arm, None))
-    random = np.random.default_rng(len(poses))
-    counts = {p.name: sum(pose.place == p.name and not pose.excluded for pose in poses) for p in setup.places}
-    chosen = min(setup.places, key=lambda p: counts[p.name] - (p.name == place) * 1000)
-    starts = random.uniform(limits[:, 0], limits[:, 1], (40, arm.joints))
-    if chosen.position is not None:
-        starts, arrived = project_to_targets(arm, starts, np.tile(chosen.position, (40, 1)), limits)
-        starts = starts[arrived]
-    if not len(starts):
-        return None
-    here = limits.mean(axis=1) if q is None else q
-    distances = np.abs(starts - here).max(axis=1)
-    best = int(np.argmin(np.abs(distances - 0.7)))
-    return NextPose(chosen.name, starts[best], "fewest poses so far", float(distances[best]))
+class _Solution(NamedTuple):
+    """A calibration: the rows of all poses, and what is known of all unknowns, those of candidates among them."""
+
+    linear: Linearisation
+    numbers: Int[np.ndarray, " m"]
+    used: Bool[np.ndarray, " m"]
+    known: Candidates
+    taken: Float[np.ndarray, "P P"]  # information of the poses alone
+    white: Float[np.ndarray, "m r"]
+    h: Float[np.ndarray, "m r r"]  # covariance of the rows by the unknowns
+    equations: Int[np.ndarray, " m"]
+    squares: float  # of the used residuals, with the usual noise
+    freedom: float
+    scale: float  # factor of U and standard uncertainties by the usual noise
+
+    @classmethod
+    def of(
+        cls, search: Search, widths: np.ndarray, capture: Capture, linear: Linearisation, numbers: np.ndarray,
+        wrong: frozenset[int],
+    ) -> "_Solution":  # fmt: skip
+        """Of rows at a solution."""
+        session = capture.sessions[-1] if capture.sessions else ""
+        later = len(capture.sessions) > 1
+        pool = search.pool(session, f"probe of {session}" if later else "")
+        p, count = len(widths), pool.candidates.rows.shape[2]
+        # Unknowns of the candidates first, then those of other sessions.
+        index, size = np.arange(len(linear.z)), count
+        for name, at in linear.observed.positions.items():
+            there = pool.columns.get(name)
+            size += len(at) if there is None else 0
+            index[p + at] = np.arange(size - len(at), size) if there is None else there
+
+        def wider(rows: np.ndarray) -> np.ndarray:
+            whole = np.zeros((*rows.shape[:-1], size))
+            whole[..., index] = rows
+            return whole
+
+        rows, used = wider(rows_by_pose(linear)[0]), ~np.isin(numbers, list(wrong))
+        relations = wider(rows_of_relations(linear)[0])
+        relations = relations[np.any(relations[:, count:] != 0, axis=1)]
+        base = PRIOR * np.eye(size)
+        base[:count, :count] = pool.candidates.base
+        base[np.arange(p), np.arange(p)] += widths**-2.0
+        flat = rows[used].reshape(-1, size)
+        taken = flat.T @ flat
+        known = pool.known(base + relations.T @ relations + taken)
+        parts = linear.parts()
+        white = np.zeros(rows.shape[:2])
+        for part in parts:
+            residual = np.asarray(part.white)
+            white[part.poses, : len(residual)] = residual.T
+        h = np.einsum("mrp,msp->mrs", rows @ np.linalg.inv(known.base), rows)
+        equations = np.concatenate([part.observation.pose_equations for part in parts])
+        squares = _FREEDOM + float(np.sum(white[used] ** 2))
+        freedom = _FREEDOM + float(np.sum(equations[used]) - np.trace(h[used], axis1=1, axis2=2).sum())
+        factor = float(student_quantile(0.5 + LEVEL / 2, freedom)) * np.sqrt(squares / freedom)
+        return cls(linear, numbers, used, known, taken, white, h, equations, squares, freedom, float(factor))
+
+    def outliers(self, newest: int) -> frozenset[int]:
+        """Numbers of the poses that do not fit: those left out that still do not, and the worst of the others."""
+        sign = np.where(self.used, -1.0, 1.0)[:, None, None]
+        values, vectors = np.linalg.eigh(np.eye(self.h.shape[1]) + sign * self.h)
+        seen = values > _OPEN
+        along = np.einsum("mrk,mr->mk", vectors, self.white)
+        squares = np.sum(np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0), axis=1)
+        count = np.maximum(seen.sum(axis=1) - (self.h.shape[1] - self.equations), 0)
+        ratios, probabilities = np.zeros(len(squares)), np.ones(len(squares))
+        for i in np.flatnonzero(count):
+            own = (squares[i], count[i]) if self.used[i] else (0.0, 0)
+            freedom = max(self.freedom - own[1], 1.0)
+            ratios[i] = squares[i] / count[i] / (max(self.squares - own[0], _FREEDOM) / freedom)
+            probabilities[i] = f_tail(ratios[i], int(count[i]), freedom)
+        still = {
+            int(n) for n, p, used in zip(self.numbers, probabilities, self.used, strict=True) if not used and p < _RIGHT
+        }
+        wrong = self.used & (probabilities * len(squares) < _WRONG)
+        if wrong.any():
+            worst = int(np.argmax(np.where(wrong, ratios, 0.0)))
+            (last,) = np.flatnonzero(self.numbers == newest)
+            if wrong[last] and ratios[last] > _NEWER * ratios[worst]:
+                worst = int(last)
+            still.add(int(self.numbers[worst]))
+        return frozenset(still)
+
+    def residuals(self) -> dict[int, PoseResidual]:
+        """The residual of every pose, mm."""
+        found, tips = {}, np.asarray(self.linear.point.forward.tip).T
+        sd = np.sqrt(self.squares / self.freedom)
+        for part in self.linear.parts():
+            rows, (observation, by_tip) = len(part.values), (part.observation, np.asarray(part.by_tip))
+            position, moved = (np.asarray(observation.in_mm(np.asarray(x), by_tip)) for x in (part.values, by_tip))
+            to_mm = np.moveaxis(np.linalg.inv(np.asarray(part.root)), 0, -1)
+            to_mm = np.moveaxis(np.asarray(observation.in_mm(to_mm, by_tip)), -1, 0)
+            sign = np.where(self.used[part.poses], -1.0, 1.0)[:, None, None]
+            covariance = np.eye(rows) + sign * self.h[part.poses, :rows, :rows]
+            u = sd * np.sqrt(np.maximum(np.einsum("mca,mab,mcb->m", to_mm, covariance, to_mm), 0.0))
+            residual = np.einsum("cxm,cm->mx", moved, position)
+            for i, at in enumerate(range(part.poses.start, part.poses.stop)):
+                number = int(self.numbers[at])
+                found[number] = PoseResidual(tips[at], residual[i], float(u[i]), not bool(self.used[at]))
+        return found

@@ -172,11 +172,12 @@ def _labels_and_tips(thing: AbstractSimulated) -> tuple[list[str], Float[np.ndar
     if isinstance(thing, AbstractInBox | SimulatedPixels):
         return [""], np.full((1, 3), np.nan)
     template, tips = _template(thing)
-    label = _label(template)
+    label = label_of(template)
     return ([""], tips[:1]) if label is None else (list(template.stored()[label]), tips)
 
 
-def _label(observation: AbstractObservation) -> str | None:
+def label_of(observation: AbstractObservation) -> str | None:
+    """The entry that names the point or side of each pose; None where there is none."""
     names = [e.name for e in observation.entries if e.content == "text" and e.of_poses and e.name != "images"]
     return names[0] if names else None
 
@@ -285,7 +286,7 @@ def observation_of(
     if isinstance(thing, SimulatedPixels):
         return _pixels(thing, q, poses)
     template = _template(thing)[0]
-    stored, label = template.stored(), _label(template)
+    stored, label = template.stored(), label_of(template)
     labels = [""] if label is None else list(stored[label])
     rows = [labels.index(points[pose.place]) if label else 0 for pose in poses]
     values: dict[str, Any] = {}

@@ -347,18 +347,23 @@ class Session:
             self._take(rest, place)
 
     def _compute(self) -> None:
+        guide: guiding.Guide | None = None  # made here, since it takes seconds
         while not self._stop.is_set():
             if not self._wake.wait(0.5):
                 continue
             self._wake.clear()
             with self._lock:
                 poses, q, forced = list(self._captured.poses), self._q, self._forced
+            found, proposed, message = None, None, ""
             try:
-                found = guiding.calibrated(self.setup, poses, self.target)
-                proposed = guiding.next_pose(self.setup, poses, found, q, forced)
-                message = ""
+                guide = guiding.Guide(self.setup, self.target) if guide is None else guide
+                try:
+                    found = guide.calibrated(poses)
+                except InputError as error:  # of data that do not determine enough yet
+                    message = str(error)
+                proposed = guide.next_pose(found, q, forced)
             except Exception as error:  # poses are taken without guidance, too
-                found, proposed, message = None, None, in_words(error)
+                message = in_words(error)
             with self._lock:
                 self._where = Whereabouts(self.setup, self._arm, self._captured.poses, found)
                 self._next, self._message = proposed, message

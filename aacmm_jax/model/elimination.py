@@ -317,9 +317,11 @@ def pseudo_inverse(matrices: Float[AnyArray, "K k k"]) -> Float[AnyArray, "K k k
     """Inverses on the directions that are determined, 0 on the others."""
     xp, size = namespace(matrices), matrices.shape[-1]
     if xp is np:
-        values, vectors = np.linalg.eigh(matrices)
+        finite = np.all(np.isfinite(matrices), axis=(1, 2), keepdims=True)  # LAPACK raises where one of them is not
+        values, vectors = np.linalg.eigh(np.where(finite, matrices, 0.0))
         large = values > _NULL * np.maximum(values[:, -1:], 1e-300)
-        return (vectors * np.where(large, 1 / np.where(large, values, 1.0), 0.0)[:, None]) @ vectors.swapaxes(-1, -2)
+        inverses = np.where(large, 1 / np.where(large, values, 1.0), 0.0)[:, None]
+        return np.where(finite, vectors * inverses @ vectors.swapaxes(-1, -2), np.nan)
     # Only a basis comes from the eigenvectors: their derivative is infinite where eigenvalues repeat.
     values, vectors = semidefinite_eigen(matrices)
     large = values > _NULL * values[:, :1]

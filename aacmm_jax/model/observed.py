@@ -190,6 +190,8 @@ class Observed:
                 new = {offset_of(observation.target): probe} | new
             parts = new | parts  # what another observation says stays
         parts |= platform_frames(self.observations, tips)
+        for observation, tips_seen in zip(self.observations, tips, strict=True):
+            parts = observation.start_with(tips_seen, parts) | parts
         return namespace(arm, forward).concatenate([parts[name] for name in self.blocks])
 
     def squared_distances(self, rows: Sequence[Rows]) -> list[Float[AnyArray, " _"]]:

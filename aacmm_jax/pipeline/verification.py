@@ -28,14 +28,17 @@ from ..core.distributions import chi_square_quantile, student_quantile, student_
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.numpy_or_jax import to_numpy
 from ..data.recording import Recording
-from ..diagnostics.equations import LEAST_U, PROBE
+from ..diagnostics.equations import LEAST_U
 from ..kinematics.arm import (
     Arm,
     by_joint,
     joint_limits,
     natural_steps,
     parameter_names,
+    probe_names,
     reading_as,
+    tips_of,
+    with_chains,
     without_corrections,
 )
 from ..kinematics.parameters import ArmSpecification, Bounds, Parameters
@@ -195,7 +198,7 @@ def verify(recording: Recording, delivered: ArmSpecification | Arm | None = None
 def _fitted(arm: Arm, capture: Any) -> "_Fit":
     """The unknown geometry, and the tip where it is not a target's, that fit an arm best."""
     targeted = not capture.sizes and all(observation.target for observation in capture.observations)
-    space = Parameters(arm, _FIXED if targeted else PROBE)
+    space = Parameters(arm, _FIXED if targeted else tuple(probe_names(tips_of(arm))))
     bounds = Bounds.around(arm, space, length=0.0 if targeted else _LENGTHS)
     solution = solve(to_numpy(task_of(arm, capture, bounds, Solving(hold=None, replace_noise=False))))
     return _Fit(solution.linear, solution.state.sigma)
@@ -367,10 +370,15 @@ class _Volume(NamedTuple):
         mean, spread = -(scale**2) * sizes * seen / variance, scale**2 * noise**2 / variance
         limits = np.asarray(joint_limits(arm, None))
         limits = np.where(np.array(by_joint(arm, True, False))[:, None], np.clip(limits, -math.pi, math.pi), limits)
-        q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_TESTED, arm.joints))
+        q = with_chains(arm, np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_TESTED, arm.joints)))
         tips, turned = np.asarray(arm.position(q)), np.asarray(arm.pose(q))[:, :3, :3]
         moved = np.stack([np.cross(axis, tips) for axis in np.eye(3)], axis=2)
-        free = np.concatenate([moved, np.tile(np.eye(3), (_TESTED, 1, 1)), turned], axis=2)
+        by_tip = turned  # of a robot, that of each pose's chain
+        if arm.chains:
+            by_tip = np.concatenate(
+                [turned * (q[:, arm.joints] == i)[:, None, None] for i in range(len(arm.chains))], axis=2
+            )
+        free = np.concatenate([moved, np.tile(np.eye(3), (_TESTED, 1, 1)), by_tip], axis=2)
         frames = _basis(free.reshape(3 * _TESTED, -1))  # of the base, and the tip
         step = _without(frames, (np.asarray(other.position(q)) - tips).ravel())
         by_parameters = _without(frames, np.asarray(arm.jacobian(q, names)).reshape(3 * _TESTED, -1)) * steps @ right.T
@@ -387,4 +395,5 @@ def _with_tip(arm: Arm, fit: Linearisation) -> tuple[Arm, tuple[str, ...]]:
     """The arm with the tip that was found, and the names of its coordinates; none where all tips are targets."""
     if fit.space.names == _FIXED:
         return arm, ()
-    return arm.replace(probe=np.asarray(fit.z)[: len(PROBE)]), PROBE
+    names = tuple(probe_names(tips_of(arm)))
+    return arm.replace(probe=np.asarray(fit.z)[: len(names)]), names

@@ -46,8 +46,9 @@ class Plan(NamedTuple):
     arm: Arm
     names: tuple[str, ...]  # free parameters
     sockets: dict[str, tuple[float, float, float]]  # in the order in which the arm visits them
-    q: Float[np.ndarray, "N n"]
-    owner: Int[np.ndarray, " N"]  # index of each pose's socket; the poses of a socket follow each other
+    q: Float[np.ndarray, "N n"]  # of a robot, of all joints, those of other chains at rest, and the number of the chain
+    # Index of each pose's socket; the poses of a socket follow each other, of a robot those of each chain in it.
+    owner: Int[np.ndarray, " N"]
     lengths: tuple[ReferenceLength, ...]
     noise: Noise
     criterion: Criterion
@@ -113,7 +114,8 @@ def plan(
         True
     """
     problem = DesignProblem.of(arm, PlanOptions(**options))
-    check_counts(sockets, poses, len(problem.space.names), u, lengths)
+    chains = max(1, len(problem.region.chains))
+    check_counts(sockets, poses, len(problem.space.names), u, lengths, chains)
     if isinstance(sockets, Mapping):
         names, placement = given_placement(sockets, u, lengths)
     else:
@@ -131,7 +133,8 @@ def plan(
     pool, q, owner = _chosen(problem, placement, names, poses)
     cones = problem.region.cones
     assert cones is not None
-    order, motion = ordered_motion(problem.region, q, owner, cones.normals[owner], problem.options.retract)
+    groups = problem.groups(q, owner)
+    order, motion = ordered_motion(problem.region, q, groups, cones.normals[owner], problem.options.retract)
     # From here on sockets have the order in which the arm visits them.
     visited = np.array(list(dict.fromkeys(owner[order].tolist())))
     place = np.argsort(visited)
@@ -203,17 +206,31 @@ def _chosen(
         q, good = reached(region, starts, placement.points[owner], sockets=owner)
         return chosen.joined(possible(q[good], owner[good]))
 
-    starts = max((problem.options.candidates or _CANDIDATES) // len(names), 50)
-    pool = possible(*configurations_at(region, placement.points, starts))
+    starts, chains = max((problem.options.candidates or _CANDIDATES) // len(names), 50), max(1, len(region.chains))
+    pool = possible(*configurations_at(region, placement.points, starts * chains))
     for _ in range(1, _ROUNDS):
-        few = np.flatnonzero(np.bincount(pool.owner, minlength=len(names)) < _LEAST_CANDIDATES)
-        if not len(few):
+        counts = np.bincount(problem.groups(pool.q, pool.owner))
+        if np.sum(counts >= _LEAST_CANDIDATES) == len(names) * chains:
             break
-        pool = pool.joined(possible(*configurations_at(region, placement.points, starts)))
-    else:
+        pool = pool.joined(possible(*configurations_at(region, placement.points, starts * chains)))
+    counts = np.bincount(problem.groups(pool.q, pool.owner), minlength=len(names) * max(1, len(problem.arm.chains)))
+    often = np.asarray(
+        counts >= _LEAST_CANDIDATES
+    )  # a chain of a robot that does not reach a socket takes no poses there
+    few = np.flatnonzero(~often.reshape(len(names), -1).any(axis=1))
+    if len(few):
         raise InputError(hardly_reached(f"socket '{names[few[0]]}'", placement.points[few[0]]))
+    reaching = often.reshape(len(names), -1).any(axis=0)
+    for number in region.chains:
+        if not reaching[number]:
+            raise InputError(
+                f"chain '{problem.arm.chains[number][0]}' reaches none of the sockets in enough poses; move a socket, "
+                "or leave out the chain (chains= or --chain)."
+            )
+    pool = pool.at(often[problem.groups(pool.q, pool.owner)])
+    least = LEAST_POSES * often[: problem.groups(pool.q, pool.owner).max() + 1]
     chosen = best_poses(
-        problem, pool, poses, LEAST_POSES, lambda pool: candidates_of(problem, placement, pool), Pool.at, near
+        problem, pool, poses, least, lambda pool: candidates_of(problem, placement, pool), Pool.at, near
     )
     return pool, chosen.q, chosen.owner
 
@@ -230,7 +247,7 @@ def _predictions(
 
     def loose() -> Iterator[Candidates]:
         region, owners, many = problem.region, np.tile(owner, _LOOSE_SETS), np.tile(q, (_LOOSE_SETS, 1))
-        starts = many + LOOSE * region.random.normal(size=many.shape)
+        starts = problem.moved(many, LOOSE)
         near, possible = reached(region, starts, placement.points[owners], sockets=owners)
         poses = pool_of(problem, np.where(possible[:, None], near, many), owners)
         for rows in np.split(candidates_of(problem, placement, poses).rows, _LOOSE_SETS):

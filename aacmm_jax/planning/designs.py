@@ -83,15 +83,17 @@ def exchange(
     *,
     least: int | Int[np.ndarray, " s"] = 2,
     sweeps: int = 12,
+    start: Sequence[int] = (),
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> Int[np.ndarray, " count"]:
-    """Indices of ``count`` candidates, at least ``least`` in every socket (one number, or one each): added greedily,
-    then exchanged one by one until a whole sweep improves nothing (Fedorov 1972). ``progress`` is called with the
-    fraction done."""
+    """Indices of ``count`` candidates, at least ``least`` in every socket (one number, or one each): added greedily to
+    those of ``start``, then exchanged one by one until a whole sweep improves nothing (Fedorov 1972). ``progress`` is
+    called with the fraction done."""
     owner, rows = candidates.owner, candidates.rows
     available = np.ones(len(owner), dtype=bool)
-    information = candidates.base.copy()
-    chosen: list[int] = []
+    chosen = [int(i) for i in start]
+    available[chosen] = False
+    information = candidates.information(rows[chosen])
 
     def take(others: list[int]) -> int:
         """Take the candidate that goes best with the others, so that every socket can still get its least number."""
@@ -103,7 +105,7 @@ def exchange(
         information += rows[best].T @ rows[best]
         return best
 
-    for number in range(count):
+    for number in range(len(chosen), count):
         chosen.append(take(chosen))
         progress(0.3 * (number + 1) / count)
     best_value, best_chosen = objective.value(covariance_of(information, candidates.parameters)), list(chosen)

@@ -97,6 +97,8 @@ def plan_kit(arm: Arm, kit: Sequence[KitItem | AbstractSimulated], *, poses: int
         u of 300 mm: at most 0.04 mm
     """
     problem, items = DesignProblem.of(arm, PlanOptions(**options)), _checked(kit)
+    if len(problem.region.chains) > 1:
+        raise InputError("a kit is planned for one chain of a robot; name the chain (chains= or --chain).")
     things = place(problem, items, poses)
     pool = _pool(problem, things)
     least = least_poses(pool)
@@ -177,20 +179,21 @@ def _chosen(
         return [observation.select(part) for observation, part in zip(pool, parts, strict=True)]
 
     def near(chosen: list[AbstractObservation]) -> list[AbstractObservation]:
-        """The poses, and others near each: joints changed, and the tip brought back."""
-        poses = []
-        for thing, observation in zip(things, chosen, strict=True):
-            seat, q = thing.seat(problem.region), np.asarray(observation.q)
-            starts, which = problem.near(q)
-            moved, good = reached(seat, starts, np.asarray(seat.arm.position(q))[which])
-            good[good] = thing.usable(problem.region, moved[good], problem.options.retract)
-            rows = np.concatenate([np.arange(len(q)), which[good]])
-            order = np.argsort(observation.places[rows], kind="stable")
-            q = np.concatenate([q, moved[good]])[order]
-            poses.append(thing.recorded(problem.region, q, observation.select(rows[order])))
-        return poses
+        return [neighbours(problem, thing, poses) for thing, poses in zip(things, chosen, strict=True)]
 
     return best_poses(problem, pool, poses, least, lambda pool: candidates_of_kit(problem, pool), taken, near)
+
+
+def neighbours(problem: DesignProblem, thing: Thing, poses: AbstractObservation) -> AbstractObservation:
+    """The poses in a thing, and others near each: joints changed, and the tip brought back."""
+    seat, q = thing.seat(problem.region), np.asarray(poses.q)
+    starts, which = problem.near(q)
+    moved, good = reached(seat, starts, np.asarray(seat.arm.position(q))[which])
+    good[good] = thing.usable(problem.region, moved[good], problem.options.retract)
+    rows = np.concatenate([np.arange(len(q)), which[good]])
+    order = np.argsort(poses.places[rows], kind="stable")
+    q = np.concatenate([q, moved[good]])[order]
+    return thing.recorded(problem.region, q, poses.select(rows[order]))
 
 
 def _in_order(
@@ -223,7 +226,7 @@ def _predictions(
     def loosened(thing: Thing, poses: AbstractObservation) -> AbstractObservation:
         """The same poses, with joints off by some degrees and the tip brought back."""
         seat, q = thing.seat(problem.region), np.asarray(poses.q)
-        starts = q + LOOSE * seat.random.normal(size=q.shape)
+        starts = problem.moved(q, LOOSE)
         moved, good = reached(seat, starts, np.asarray(seat.arm.position(q)))
         good[good] = thing.usable(problem.region, moved[good], 0.0)
         return thing.recorded(problem.region, np.where(good[:, None], moved, q), poses)

@@ -16,7 +16,7 @@ from ..calibration.evaluation import fit_geometry
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.rotations import rotation_vector
-from ..data.capture import Capture
+from ..data.capture import Capture, ReferenceLength
 from ..data.observations.observation import AbstractObservation
 from ..data.observations.simulated import AbstractSimulated
 from ..kinematics.workspace import TOOL_AXIS, Cone, SearchRegion, cones_of, lowest_point, reached, total_link_length
@@ -150,9 +150,12 @@ def set_up(
     return whole.select(np.flatnonzero(good))
 
 
-def candidates_of_kit(problem: DesignProblem, observations: Sequence[AbstractObservation]) -> Candidates:
-    """The information that each pose of the observations would add, and that of certified values alone."""
-    observed, space = Observed.of(Capture({}, (), observations), problem.arm), problem.space
+def candidates_of_kit(
+    problem: DesignProblem, observations: Sequence[AbstractObservation], lengths: Sequence[ReferenceLength] = ()
+) -> Candidates:
+    """The information that each pose of the observations would add, and that of certified values and reference lengths
+    alone; unknowns are in the order of `Observed.of`."""
+    observed, space = Observed.of(Capture({}, lengths, observations), problem.arm), problem.space
     vector, p = np.asarray(space.vector()), len(space.names)
 
     def linear_at(geometry: Float[AnyArray, " g"]) -> Linearisation:
@@ -162,7 +165,14 @@ def candidates_of_kit(problem: DesignProblem, observations: Sequence[AbstractObs
     linear = linear_at(observed.start(space, vector))
     if max(np.abs(rows.values).max() for rows in linear.point.rows) > _START_AGREES:
         linear = linear_at(fit_geometry(problem.arm, observed, {}, problem.noise).geometry)
-    parts = linear.dense()
+    rows, owner = rows_by_pose(linear)
+    relations, _ = rows_of_relations(linear)
+    return Candidates(rows, owner, PRIOR * np.eye(len(linear.z)) + relations.T @ relations, p)
+
+
+def rows_by_pose(linear: Linearisation) -> tuple[Float[np.ndarray, "m r z"], Int[np.ndarray, " m"]]:
+    """Whitened derivatives of each pose by all unknowns in natural steps, and the place that it belongs to."""
+    parts, observed = linear.dense(), linear.observed
     rows = np.zeros((len(observed.q), max(3, *(part.shape[1] for part in parts)), len(linear.z)))
     owner = np.empty(len(observed.q), dtype=int)
     places = 0
@@ -170,9 +180,15 @@ def candidates_of_kit(problem: DesignProblem, observations: Sequence[AbstractObs
         rows[poses, : part.shape[1]] = np.moveaxis(np.asarray(part) * linear.steps[:, None, None], 0, 2).swapaxes(0, 1)
         owner[poses] = places + observation.places
         places = owner[poses].max() + 1
-    relations, _, u = linear.relations()
-    scaled = relations * linear.steps / np.maximum(u, _LEAST_U)[:, None]
-    return Candidates(rows, owner, PRIOR * np.eye(len(linear.z)) + scaled.T @ scaled, p)
+    return rows, owner
+
+
+def rows_of_relations(linear: Linearisation) -> tuple[Float[np.ndarray, "l z"], Float[np.ndarray, " l"]]:
+    """Whitened derivatives of reference lengths and certified values by all unknowns in natural steps, and their
+    residuals in standard deviations."""
+    relations, residuals, u = linear.relations()
+    u = np.maximum(u, _LEAST_U)
+    return relations * linear.steps / u[:, None], residuals / u
 
 
 def least_poses(observations: Sequence[AbstractObservation]) -> Int[np.ndarray, " s"]:

@@ -9,8 +9,10 @@ from jaxtyping import Bool, Float, Int
 
 from ..core.numpy_or_jax import to_numpy
 from ..kinematics.arm import Arm
+from ..kinematics.chain import reading_units
 from ..kinematics.collisions import clearances, is_clear, nearest_contact
 from ..kinematics.inverse_kinematics import project_to_targets, readings_at_poses
+from ..kinematics.robots import chains_of
 from ..kinematics.workspace import Cone, SearchRegion, cones_of, lowest_point, tilts
 
 _STEP = np.radians(2.0)  # largest step of a joint between samples of a move
@@ -47,7 +49,7 @@ def approaches(
     poses = np.asarray(region.arm.pose(q)).copy()
     poses[:, :3, 3] += retract * normals
     solution = readings_at_poses(region.arm, q, poses, region.limits.tolist())
-    above, good = np.array(solution.q), np.array(solution.reached)
+    above, good = np.hstack([solution.q, q[:, region.arm.joints :]]), np.array(solution.reached)
     rows = np.flatnonzero(~good)
     if len(rows):
         above[rows], good[rows] = project_to_targets(region.arm, q[rows], poses[rows, :3, 3], region.limits)
@@ -63,7 +65,9 @@ def move_contacts(
     """For each straight move of the joints: what touches at the first sample that is not clear, or None."""
     if region.cell is None or not len(start):
         return [None] * len(start)
-    counts = np.maximum(np.ceil(np.abs(end - start).max(axis=1) / _STEP).astype(int), 1) + 1
+    n = region.arm.joints
+    steps = np.abs(end - start)[:, :n] / reading_units(region.arm.geometry)
+    counts = np.maximum(np.ceil(steps.max(axis=1) / _STEP).astype(int), 1) + 1
     move = np.repeat(np.arange(len(start)), counts)
     fraction = np.concatenate([np.linspace(0, 1, count) for count in counts])[:, None]
     samples = start[move] + fraction * (end - start)[move]
@@ -88,6 +92,7 @@ def ordered_motion(
     where there is one.
     """
     weights = joint_weights(region.arm)
+    weights = np.concatenate([weights, np.zeros(q.shape[1] - len(weights))])
     above = approaches(region, q, normals, retract)[0] if retract else None
     through = q if above is None else above
     contacts: dict[tuple[int, int], tuple[str, str] | None] = {}
@@ -128,7 +133,14 @@ def hardly_reached(name: str, point: Float[np.ndarray, " 3"]) -> str:
 
 
 def joint_weights(arm: Arm) -> Float[np.ndarray, " n"]:
-    """What a radian of each joint counts: how much of the arm is beyond it, relative to the most; 0.1 at least."""
+    """What a radian of each joint counts: how much of the arm is beyond it, relative to the most; 0.1 at least. Of a
+    robot, how much of a chain."""
+    if arm.chains:
+        whole = np.zeros(arm.joints)
+        for chain in chains_of(arm).values():
+            own = np.array(chain.joints) - 1
+            whole[own] = np.maximum(whole[own], joint_weights(chain.arm))
+        return whole
     arm = to_numpy(arm)
     lengths = np.abs(arm.a) + np.abs(arm.d)
     beyond = np.cumsum(lengths[::-1])[::-1] + np.linalg.norm(arm.probe)

@@ -47,7 +47,9 @@ class FixturePlacement(NamedTuple):
         return FixturePlacement(self.points[sockets], ends, self.u)
 
 
-def check_counts(sockets: int | Mapping, poses: int, parameters: int, u: float, lengths: Sequence[tuple]) -> None:
+def check_counts(
+    sockets: int | Mapping, poses: int, parameters: int, u: float, lengths: Sequence[tuple], chains: int = 1
+) -> None:
     """Raise `InputError` where there are too few poses, or an uncertainty is none."""
     for stated in (u, *(float(pair[2]) for pair in lengths if len(pair) > 2)):
         if not _U_RANGE[0] <= stated <= _U_RANGE[1]:
@@ -56,10 +58,11 @@ def check_counts(sockets: int | Mapping, poses: int, parameters: int, u: float, 
                 f"{_U_RANGE[1]:g} mm."
             )
     number = len(sockets) if isinstance(sockets, Mapping) else sockets
-    if number < 1 or poses < LEAST_POSES * number:
+    if number < 1 or poses < LEAST_POSES * number * chains:
+        several = "" if chains == 1 else f" and {chains} chains"
         raise InputError(
-            f"{poses} poses are too few for {number} sockets; give at least one socket, and at least {LEAST_POSES} "
-            "poses per socket."
+            f"{poses} poses are too few for {number} sockets{several}; give at least one socket, and at least "
+            f"{LEAST_POSES * chains} poses per socket."
         )
     unknowns = parameters + 3 * number - (len(lengths) if isinstance(sockets, Mapping) else number // 2)
     if 3 * poses < unknowns:
@@ -114,9 +117,11 @@ class Pool(NamedTuple):
         """Both."""
         return Pool(*(np.concatenate(parts) for parts in zip(self, other, strict=True)))
 
-    def fewest(self, sockets: int) -> int:
-        """The number of configurations in the socket that has the fewest."""
-        return int(np.bincount(self.owner, minlength=sockets).min())
+    def fewest(self, problem: DesignProblem, sockets: int) -> int:
+        """The number of configurations in the socket that has the fewest, of a robot by the chain that has."""
+        chains = list(problem.region.chains) or [0]
+        counts = np.bincount(problem.groups(self.q, self.owner), minlength=sockets * max(1, len(problem.arm.chains)))
+        return int(counts.reshape(sockets, -1)[:, chains].min())
 
 
 def pool_of(problem: DesignProblem, q: Float[np.ndarray, "c n"], owner: Int[np.ndarray, " c"]) -> Pool:
@@ -147,7 +152,7 @@ def candidates_of(problem: DesignProblem, placement: FixturePlacement, pool: Poo
         direction = between / np.linalg.norm(between)
         row[p + 3 * end : p + 3 * end + 3], row[p + 3 * start : p + 3 * start + 3] = direction, -direction
         base += np.outer(row, row) / u**2
-    return Candidates(rows, pool.owner, base, p)
+    return Candidates(rows, problem.groups(pool.q, pool.owner), base, p)
 
 
 def best_placement(
@@ -177,7 +182,7 @@ def best_placement(
             "no placement was found in which the arm reaches all sockets in enough poses; give a region nearer to the "
             f"arm, or a shorter length{wider}."
         )
-    starts = _STARTS // sockets
+    starts = _STARTS // sockets * max(1, len(problem.region.chains))
 
     def pool_in(placement: FixturePlacement, best: FixturePlacement | None, pool: Pool | None) -> Pool:
         if best is None or pool is None:
@@ -185,7 +190,7 @@ def best_placement(
         return _moved_pool(problem, pool, best, placement, starts)
 
     def score(placement: FixturePlacement, pool: Pool) -> float:
-        if pool.fewest(sockets) < LEAST_POSES:
+        if pool.fewest(problem, sockets) < LEAST_POSES:
             return np.inf
         return relaxed_value(candidates_of(problem, placement, pool), poses, problem.objective, _ITERATIONS)
 
@@ -223,13 +228,14 @@ def _random_scores(problem: DesignProblem, placements: Sequence[FixturePlacement
     """The objective for so many random poses in each placement; infinite if a socket is hard to reach."""
     sockets = len(placements[0].points)
     points = np.concatenate([placement.points for placement in placements])
-    pool = pool_of(problem, *configurations_at(problem.region, points, _FEW_STARTS))
+    starts = _FEW_STARTS * max(1, len(problem.region.chains))
+    pool = pool_of(problem, *configurations_at(problem.region, points, starts))
     scores = []
     for number, placement in enumerate(placements):
         part = pool.at(pool.owner // sockets == number)
         part = part._replace(owner=part.owner % sockets)
         score = np.inf
-        if part.fewest(sockets) >= _REACHED * _FEW_STARTS:
+        if part.fewest(problem, sockets) >= _REACHED * _FEW_STARTS:
             score = relaxed_value(candidates_of(problem, placement, part), poses, problem.objective, 0)
         scores.append(score)
     return scores

@@ -7,16 +7,17 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..core.arguments import Count, Range, checked_fields
-from ..core.errors import InputError
+from ..core.arguments import Count, Range, checked, checked_fields
+from ..core.arrays import Numbers
+from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import to_numpy
 from ..data.noise import CLASSES, ArmNoise, Noise, small_arm_noise
-from ..kinematics.arm import Arm, is_single, jacobian_at, joint_limits, one_chain
-from ..kinematics.chain import reading_units
+from ..kinematics.arm import Arm, correction_names, is_single, jacobian_at, joint_limits
 from ..kinematics.collisions import Cell, HalfSpace
 from ..kinematics.corrected_arm import loads_of
 from ..kinematics.corrections import coefficient_of
 from ..kinematics.parameters import Parameters
+from ..kinematics.robots import chains_of, mount_names
 from ..kinematics.workspace import (
     TOOL_AXIS,
     Cone,
@@ -65,6 +66,10 @@ class PlanOptions(NamedTuple):
         margin: Distance of the joints from their limits, rad.
         above: Height in the base frame below which no joint and no tip comes (the table), mm; ``-math.inf`` for none.
             With a ``cell`` the body's capsules stay above it too.
+        chains: Of a robot: the chains that take poses, by default all. Parameters of other chains are fixed, and so is
+            the base where a single chain is left.
+        rest: Of a robot: readings of all its joints, rad or mm, of which those of other chains hold while a chain takes
+            a pose. By default 0, or the middle of limits that leave it out.
         tool_axis: Axis of the last frame that points from the tool into a socket.
         cell: The arm's body and the obstacles that it may not touch; by default nothing is checked.
         retract: Distance from the socket to the approach point of each pose along the normal, mm; 0 for none. In a kit,
@@ -90,6 +95,8 @@ class PlanOptions(NamedTuple):
     limits: Sequence[Sequence[float]] | None = None
     margin: float = math.radians(5)
     above: float = 0.0
+    chains: Sequence[str] = ()
+    rest: Numbers | None = None
     tool_axis: tuple[float, float, float] = TOOL_AXIS
     cell: Cell | None = None
     retract: Annotated[float, Range(least=0, most=1000, unit="mm")] = 0.0
@@ -141,8 +148,9 @@ class DesignProblem(NamedTuple):
         """
         if not is_single(arm):
             raise InputError("a plan needs a single arm, but this is a batch; select one arm of the batch.")
-        options, arm = checked_fields(options), one_chain(arm, "a plan")
+        options = checked_fields(options)
         space = Parameters.free_of(arm) if options.space is None else options.space
+        taken, space = _chains(arm, options, space)
         # What is recorded beside readings is not known of planned poses, but for the torques of known masses.
         known = "torques" if arm.corrections is not None and loads_of(arm) else ""
         columns = {name: term.kind.column_of(term) for name in space.names if (term := coefficient_of(name))}
@@ -173,6 +181,7 @@ class DesignProblem(NamedTuple):
             cell = cell._replace(obstacles=(table, *cell.obstacles))
         cones = cones_of([Cone()], options.tool_axis)
         region = search_region(arm, options.limits, options.margin, options.above, seed, cones, cell)
+        region = region._replace(chains=taken, rest=_rest(arm, options.rest, region.rest))
         limits = joint_limits(arm, options.limits)
         of_objective, of_predictions = (
             length_derivatives(
@@ -207,8 +216,42 @@ class DesignProblem(NamedTuple):
     def near(self, q: Float[np.ndarray, "N n"]) -> tuple[Float[np.ndarray, "m n"], Int[np.ndarray, " m"]]:
         """Configurations near some, with the tips off their places; and which of these each is near."""
         which = np.repeat(np.arange(len(q)), _NEIGHBOURS)
-        steps = _NEAR * reading_units(self.arm.geometry) * self.region.random.normal(size=(len(which), q.shape[1]))
-        return q[which] + steps, which
+        return self.moved(q[which], _NEAR), which
+
+    def moved(self, q: Float[np.ndarray, "N n"], size: float) -> Float[np.ndarray, "N n"]:
+        """Configurations with each joint moved by a random step of this standard deviation, rad, or m; of a robot,
+        joints of the pose's chain."""
+        return q + size * self.region.units(q) * self.region.random.normal(size=q.shape)
+
+    def groups(self, q: Float[np.ndarray, "N n"], owner: Int[np.ndarray, " N"]) -> Int[np.ndarray, " N"]:
+        """Poses that follow each other in a plan: those in one place, of a robot also with the same chain."""
+        return owner * len(self.arm.chains) + q[:, self.arm.joints].astype(int) if self.arm.chains else owner
+
+
+def _chains(arm: Arm, options: PlanOptions, space: Parameters) -> tuple[tuple[int, ...], Parameters]:
+    """Numbers of the chains that take poses, and the parameters that these move."""
+    names = [name for name, _ in arm.chains]
+    for name in options.chains:
+        if name not in names:
+            what = f"the robot has no chain '{name}'{nearest(name, names)}" if names else "the arm has no chains."
+            raise InputError(what)
+    if not options.chains or set(options.chains) == set(names):
+        return tuple(range(len(names))), space
+    chosen = [chain for name, chain in chains_of(arm).items() if name in options.chains]
+    own = {name for chain in chosen for name in chain.names.values()}
+    own |= {name for chain in chosen[1:] for name in mount_names(chain)} - set(mount_names(chosen[0]))
+    corrections = set(correction_names(arm))
+    kept = tuple(name for name in space.names if name in own | corrections)
+    return tuple(chain.number for chain in chosen), Parameters(space.base, kept)
+
+
+def _rest(arm: Arm, given: Numbers | None, usual: Float[np.ndarray, " n"] | None) -> Float[np.ndarray, " n"] | None:
+    """Readings of joints at rest."""
+    if given is None:
+        return usual
+    if not arm.chains:
+        raise InputError("rest is given, but the arm has no chains; leave it out.")
+    return checked(given, Float[np.ndarray, " joints"], "rest", {"joints": arm.joints})
 
 
 def length_derivatives(

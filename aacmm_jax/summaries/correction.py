@@ -8,7 +8,7 @@ from jaxtyping import Float
 from ..core.text import pluralise, shorten
 from ..core.units import DEG
 from ..kinematics.arm import Arm, by_joint
-from ..kinematics.inverse_kinematics import FULL_POSE, ReadingsAtPoses, least_motion
+from ..kinematics.inverse_kinematics import FULL_POSE, ReadingsAtPoses, free_joints, least_motion
 from .tables import View, formatted, listed, plain, warnings_of, written_of
 
 _SINGULAR = 3.0  # mm a rad: 1 mm takes 20 deg of the joints; axes of a wrist are within half a degree of each other
@@ -32,13 +32,15 @@ def correction_summary(
     orientations nothing is known of the arm without a correction.
     """
     reached, after = np.asarray(corrected.reached), np.asarray(corrected.q)
-    commanded, distance, angle = q[:, : nominal.joints], np.asarray(corrected.distance), np.asarray(corrected.angle)
+    n, kinds = nominal.joints, nominal.geometry.kinds
+    moving = np.ones(n, dtype=bool) if kinds is None else kinds.read > 0
+    commanded, distance, angle = q[:, :n], np.asarray(corrected.distance), np.asarray(corrected.angle)
     largest = ("distance_before_mm", "distance_mm", "angle_deg", "change", "slide")
     warnings: list[str] = []
     summary: dict[str, Any] = {
         "rows": len(reached),
         "unit": unit,
-        "position_only": nominal.joints < FULL_POSE,
+        "position_only": free_joints(nominal.geometry, q) < FULL_POSE,
         **dict.fromkeys((f"largest_{name}" for name in largest), None),
         "singular": [],
         "not_reached": [],
@@ -47,18 +49,19 @@ def correction_summary(
     at_limit = np.zeros(after.shape, dtype=bool)
     if nominal.limits is not None:
         low, high = np.asarray(nominal.limits).T
-        at_limit = (after <= low) | (after >= high)  # where the search ended
+        at_limit = ((after <= low) | (after >= high)) & moving  # where the search ended
     for row in np.flatnonzero(~reached).tolist():
         missed = {"row": row + 1, "distance_mm": distance[row], "angle_deg": angle[row] / DEG}
         summary["not_reached"].append(plain(missed | {"joints_at_limit": np.flatnonzero(at_limit[row]) + 1}))
     if summary["position_only"]:
         warnings.append(
-            f"The arm has {pluralise(nominal.joints, 'joint')}, fewer than six, so only positions are corrected, not "
-            "orientations."
+            f"The arm has {pluralise(free_joints(nominal.geometry, q), 'joint')}, fewer than six, so only positions "
+            "are corrected, not orientations."
         )
     if not reached.any():
         return summary
-    near = least_motion(nominal, commanded if of_readings else after) < _SINGULAR
+    beside = q[:, n : nominal.beside.own]
+    near = least_motion(nominal, np.hstack([commanded if of_readings else after, beside])) < _SINGULAR
     summary["singular"] = (np.flatnonzero(near & reached) + 1).tolist()
     if summary["singular"]:
         rows = shorten([str(row) for row in summary["singular"]])
@@ -72,7 +75,9 @@ def correction_summary(
     summary["largest_angle_deg"] = float(angle[reached].max() / DEG)
     if not of_readings:
         return summary
-    before = np.asarray(calibrated.position(q[reached])) - np.asarray(nominal.position(commanded[reached]))
+    before = np.asarray(calibrated.position(q[reached])) - np.asarray(
+        nominal.position(q[reached, : nominal.beside.own])
+    )
     summary["largest_distance_before_mm"] = float(np.linalg.norm(before, axis=1).max())
     moved = np.where(reached[:, None], np.abs(after - commanded), 0.0)
     change, slide = (moved * np.array(by_joint(nominal, *units)) for units in ((1 / DEG, 0.0), (0.0, 1.0)))

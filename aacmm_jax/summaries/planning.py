@@ -11,6 +11,7 @@ from ..acceptance.procedure import Procedure
 from ..acceptance.standards import PLANNED
 from ..core.text import pluralise
 from ..data.noise import linear_encoder_mm
+from ..kinematics.robots import chains_taken
 from ..planning.design import Plan
 from ..planning.kit import KitPlan
 from ..planning.motion import Motion
@@ -35,6 +36,7 @@ def plan_summary(plan: Plan, arm: str) -> dict[str, Any]:
             "socket": name,
             "position_mm": list(point),
             "poses": int(np.sum(plan.owner == i)),
+            **({"chains": dict(Counter(chains_taken(plan.arm, plan.q[plan.owner == i])))} if plan.arm.chains else {}),
             "normal": plan.cones.normals[i].tolist(),
             "cone_deg": math.degrees(float(plan.cones.half_angles[i])),
             "largest_tilt_deg": math.degrees(float(plan.motion.tilt[plan.owner == i].max())),
@@ -134,11 +136,13 @@ def plan(summary: dict[str, Any]) -> View:
     """Positions of the sockets, and the predicted uncertainty, compared with that of random poses."""
     yield from _answer(summary)
     sockets = pluralise(len(summary["sockets"]), "socket")
+    chains = sorted({chain for row in summary["sockets"] for chain in row.get("chains", ())})
     yield [Styled(summary["arm"]), f": {summary['poses']} poses in {sockets}"]
     yield listed("", summary["sockets"], {
         "socket": "socket",
         **{f"{axis} [mm]": lambda row, i=i: number(row["position_mm"][i], 0) for i, axis in enumerate("xyz")},
         "poses": "poses",
+        **{chain: lambda row, chain=chain: row["chains"].get(chain, 0) for chain in chains},
         "cone [deg]": lambda row: "any" if row["cone_deg"] >= 180 else number(row["cone_deg"], 0),
         "largest tilt [deg]": lambda row: number(row["largest_tilt_deg"], 0),
     })  # fmt: skip

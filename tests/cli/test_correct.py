@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
-from aacmm_jax.cli.controller_commands import in_first_frame
+from aacmm_jax.cli.commanded import in_first_frame
 from aacmm_jax.kinematics.inverse_kinematics import corrected_readings
 from aacmm_jax.summaries.correction import correction_summary
 

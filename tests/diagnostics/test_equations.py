@@ -70,3 +70,9 @@ def test_groups_are_found(sizes, errors, expected):
     blocks = problem(np.random.default_rng(2), sizes, errors)
     found = found_in(blocks, least_ratio=3.0)
     assert [{test.group for test in tests} for tests in found] == expected
+
+
+def test_a_group_without_which_nothing_fixes_the_scale_is_not_tested():
+    blocks = problem(np.random.default_rng(0), (6, 9, 8, 10), {1: 3.0})
+    assert found_in(blocks, scales=[frozenset({1, 2}), frozenset({2, 3})])[0][0].group == 1
+    assert not any(test.group == 1 for tests in found_in(blocks, scales=[frozenset({1, 2})]) for test in tests)

@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
-from aacmm_jax.kinematics.arm import parameter_names
+from aacmm_jax.kinematics.arm import correction_names, parameter_names
 from aacmm_jax.kinematics.axes_to_dh import rotation
 from aacmm_jax.kinematics.chain import forward_pass, joint_motion
 from aacmm_jax.kinematics.jacobian import pose_columns, rotation_columns
-from aacmm_jax.kinematics.robots import ChainOf, default_names, mount_names, with_bases, with_chain
+from aacmm_jax.kinematics.robots import ChainOf, chains_of, default_names, mount_names, with_bases, with_chain
 
 
 def rows(seed: int, count: int, **first: float) -> dict[str, np.ndarray]:
@@ -213,3 +213,33 @@ def test_calibrated_together_within_their_uncertainty():
     result = aj.calibrate(whole, capture, aj.Bounds.around(whole, space), method="joint")
     z = (np.asarray(space.vector(result.arm)) - np.asarray(space.vector(true))) / np.sqrt(np.diag(result.covariance))
     assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=0.35)
+
+
+@pytest.mark.parametrize("model", ["harmonics=1,gear,coupled=2-3+10-11", "gravity", "backlash=gravity"])
+def test_a_chain_keeps_its_joint_corrections(model):
+    _, whole, _ = ROBOTS["two bases"]
+    if "backlash" in model:  # which is for an upright base
+        with pytest.raises(aj.InputError, match="base of chain 'right' is tilted"):
+            aj.kinematics.chain_of(aj.kinematics.with_corrections(whole, model), "right")
+        whole = aj.kinematics.together(TWO, bases={"right": (300.0, -800.0, 50.0)})
+    corrected = aj.kinematics.with_corrections(whole, model)
+    assert corrected.corrections is not None
+    names = corrected.corrections.functions.names
+    corrected = corrected.replace(coefficients=1e-3 * np.random.default_rng(0).normal(size=len(names)))
+    for name in ("left", "right"):
+        chain = aj.kinematics.chain_of(corrected, name)
+        q = np.random.default_rng(1).uniform(-1, 1, (5, len(chain.joints)))
+        poses = np.asarray(corrected.pose(chain.readings(q)))
+        np.testing.assert_allclose(chain.base @ np.asarray(chain.arm.pose(q)), poses, atol=1e-9)
+        plain = aj.kinematics.chain_of(whole, name)
+        assert np.abs(plain.base @ np.asarray(plain.arm.pose(q)) - poses).max() > 1e-3
+        assert set(correction_names(chain.arm)) & set(chain.names)
+
+
+def test_masses_of_a_robot_belong_to_no_chain_alone():
+    _, whole, _ = ROBOTS["two bases"]
+    loads = {"mass": np.ones(whole.joints), "centre": np.zeros((whole.joints, 3))}
+    heavy = aj.kinematics.with_corrections(whole, "gravity=masses", **loads)
+    with pytest.raises(aj.InputError, match="masses of all links"):
+        aj.kinematics.chain_of(heavy, "left")
+    assert set(chains_of(heavy)) == {"left", "right"}

@@ -1,3 +1,7 @@
+from .contacts import PlaneContact as PlaneContact
+from .contacts import SimulatedPlaneContact as SimulatedPlaneContact
+from .contacts import SimulatedSphereContact as SimulatedSphereContact
+from .contacts import SphereContact as SphereContact
 from .corner_tables import Camera as Camera
 from .corner_tables import CornerTable as CornerTable
 from .corner_tables import pixels_of as pixels_of

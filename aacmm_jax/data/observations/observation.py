@@ -116,6 +116,10 @@ class AbstractObservation(Declared):
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
         """The unknowns from nearly right tips; ``offset`` is the arm's own probe in the last frame, mm."""
 
+    def start_with(self, tips: Tips, parts: Mapping[str, Any]) -> Parts:
+        """Unknowns that follow from those of other observations, which have started."""
+        return {}
+
     @abc.abstractmethod
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
         """The residuals at these tips and this geometry, whose numbers are columns: one for all poses, or one each.

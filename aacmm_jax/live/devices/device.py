@@ -1,6 +1,7 @@
 """What every device has: what came since, what was bad of it, and whether it is connected."""
 
 import abc
+import math
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any
@@ -81,5 +82,7 @@ def numbers_of(where: str, options: Mapping[str, str], known: Mapping[str, float
         try:
             values[name] = number(text)
         except ValueError:
-            raise InputError(f"option {name} of device '{where}' is '{text}'; give a number.") from None
+            values[name] = math.nan
+        if not math.isfinite(values[name]):
+            raise InputError(f"option {name} of device '{where}' is '{text}'; give a number.")
     return values

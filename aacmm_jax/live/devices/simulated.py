@@ -44,6 +44,7 @@ _OPTIONS = {
 }
 _FASTEST = 1.2  # rad/s, or m/s of prismatic joints
 _AHEAD = 0.5  # s that are computed at once
+_IDLE = 0.1  # s that an operator without a goal waits for one
 _TRIES = 12
 
 
@@ -110,18 +111,18 @@ class Simulated(AbstractDevice):
         # Time runs slower where the computer cannot keep up, and stands still while it sleeps.
         now = self._now = self._now + min(elapsed * self.options["speed"], _AHEAD)
         while self._clock < now:
-            self._compute(now)
+            self._compute()
         count = next((i for i, sample in enumerate(self._ready) if sample.time > now), len(self._ready))
         due, self._ready = self._ready[:count], self._ready[count:]
         self.lines += count
         return due
 
-    def _compute(self, now: float) -> None:
+    def _compute(self) -> None:
         """The next stretch: a motion to the goal and the hold there, or rest where the tip is."""
         try:
             self._place, q = self._goals.pop()
         except IndexError:
-            self._hold(min(_AHEAD, max(now - self._clock, 0.02)))
+            self._hold(_IDLE)
             return
         wanted, self._seated = self._there(q)
         self._move(wanted)

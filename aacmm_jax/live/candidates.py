@@ -1,0 +1,205 @@
+"""The poses that may be taken next: candidates in every place, and the set of them that reaches a target first.
+
+The pose that is best on its own is often a poor start of a design. So all that is left of a capture is planned, by
+exchange (`planning.designs`), again after every pose and from what was taken until then; of the planned poses the one
+nearest to the present readings comes next.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..core.errors import InputError
+from ..data.capture import Capture
+from ..data.capture_data import ReferenceLength
+from ..data.observations.observation import AbstractObservation
+from ..model.observed import Observed
+from ..planning.designs import Candidates, covariance_of, exchange
+from ..planning.kit import neighbours
+from ..planning.kit_placement import Thing, candidates_of_kit, set_up
+from ..planning.placement import LEAST_POSES
+from ..planning.problem import DesignProblem, PlanOptions
+from .places import Setup, by_thing, label_of
+
+TEN = 10  # poses that a prediction is for
+_STARTS = 2000  # random configurations in all things
+_FIRST, _MOST, _ADDED = 30, 60, 3  # poses of a plan where nothing is stated; the most ahead; added to them at once
+_SEARCHED = 400  # candidates that an exchange tries, drawn anew after every pose
+
+Observations = Sequence[AbstractObservation]
+
+
+class Pool(NamedTuple):
+    """Candidates by the nominal arm, in one session."""
+
+    q: Float[np.ndarray, "c n"]
+    place: Int[np.ndarray, " c"]  # index of each one's place in the setup
+    candidates: Candidates
+    columns: dict[str, np.ndarray]  # of each part of the unknown geometry, among all unknowns
+
+    def known(self, information: Float[np.ndarray, "P P"]) -> Candidates:
+        """The candidates, where so much is known already of their unknowns and perhaps of others."""
+        rows = self.candidates.rows
+        wider = np.pad(rows, ((0, 0), (0, 0), (0, len(information) - rows.shape[2])))
+        return self.candidates._replace(rows=wider, base=information)
+
+
+class Search:
+    """The candidates of a setup, and its first plan.
+
+    Args:
+        setup: The arm, and the places.
+        options: How poses are planned; by default as is usual for the arm's class, and above the table where no place
+            is below it.
+
+    Raises:
+        InputError: No place can be reached, or there is nothing to plan for such an arm.
+    """
+
+    def __init__(self, setup: Setup, options: PlanOptions | None = None):
+        self.setup = setup
+        if options is None:
+            heights = [float(place.position[2]) for place in setup.places if place.position is not None]
+            above = 0.0 if min(heights, default=0.0) >= 0 else -math.inf
+            options = PlanOptions.usual(setup.noise)._replace(space=setup.specification.space(), above=above)
+        self.problem = DesignProblem.of(setup.specification.arm, options)
+        self.things, self.unreached = dict[str, Thing](), dict[str, str]()
+        drawn, groups = [], by_thing(setup)
+        for name, places in groups.items():
+            thing = Thing(places[0].item, places[0].thing)
+            try:
+                poses = set_up(self.problem.region, thing, _STARTS // len(groups), retract=self.problem.options.retract)
+            except InputError as error:
+                self.unreached[name] = str(error)
+                continue
+            self.things[name] = thing
+            drawn.append(poses)
+        if not self.things:
+            raise InputError(next(iter(self.unreached.values())))
+        self._names = {place.name: i for i, place in enumerate(setup.places)}
+        self._pools: dict[tuple[str, str], Pool] = {}
+        every = np.full(len(setup.places), LEAST_POSES)
+        stated, self.planned = self._stated(drawn)
+        first = [stated, drawn] if self.planned else [drawn]
+        if not self.planned:
+            pool = self._pool(first, "", "")
+            self.planned = self.chosen(pool.candidates, min(_FIRST, len(pool.q)), least=every, sweeps=3)
+        # Poses near to chosen ones are often far better than random ones.
+        self._sets = [*first, self._near(first[0])]
+        if len(first) == 1:
+            self.planned = self.chosen(self.pool().candidates, len(self.planned), self.planned, every, sweeps=2)
+
+    def chosen(
+        self,
+        candidates: Candidates,
+        count: int,
+        start: Sequence[int] = (),
+        least: int | Int[np.ndarray, " s"] = 0,
+        sweeps: int = 0,
+    ) -> list[int]:
+        """The best candidates, beginning with some, and at least so many in each place."""
+        if not isinstance(least, int):  # nothing is asked of a place without candidates
+            there = np.bincount(candidates.owner)
+            least = np.minimum(least[: len(there)], there)
+        return exchange(candidates, count, self.problem.objective, least=least, sweeps=sweeps, start=start).tolist()
+
+    def pool(self, session: str = "", probe: str = "") -> Pool:
+        """The candidates in a session of several: its name, and that of its probe as in `join_sessions`."""
+        if (session, probe) not in self._pools:
+            self._pools[session, probe] = self._pool(self._sets, session, probe)
+        return self._pools[session, probe]
+
+    def u(self, information: Float[np.ndarray, "P P"]) -> float:
+        """Largest standard uncertainty of a length over the volume, mm."""
+        covariance = covariance_of(information, len(self.problem.space.names))
+        return float(np.sqrt(max(self.variances(covariance).max(), 0.0)))
+
+    def variances(self, covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, " v"]:
+        """Of the lengths over the volume, mm^2."""
+        return np.sum(self.problem.lengths @ covariance * self.problem.lengths, axis=1)
+
+    def ahead(
+        self, known: Candidates, ahead: Sequence[int], least: Int[np.ndarray, " s"], target: float | None
+    ) -> list[int]:
+        """What is left to be taken, planned again: as many poses as before, or some more or less where these do not
+        reach the target (a standard uncertainty, mm) or fewer do; at least so many in each place."""
+        random, count = self.problem.region.random, len(known.rows)
+        tried = np.unique([*ahead, *random.choice(count, min(_SEARCHED, count), replace=False)]).astype(int)
+        part = known._replace(rows=known.rows[tried], owner=known.owner[tried])
+        chosen = np.searchsorted(tried, ahead).tolist()
+        chosen = self.chosen(part, max(len(chosen), 1), chosen, least, sweeps=1)
+
+        def u(rows: Sequence[int]) -> float:
+            return self.u(part.information(part.rows[list(rows)]))
+
+        if target is not None and u(chosen) > target and len(chosen) < _MOST:
+            chosen = self.chosen(part, len(chosen) + _ADDED, chosen, least, sweeps=1)
+        while target is not None and len(chosen) > 1 and u(chosen) <= target:  # without that which is worth least
+            spare = np.bincount(part.owner[chosen], minlength=len(least)) > least
+            fewer = [[*chosen[:i], *chosen[i + 1 :]] for i in range(len(chosen)) if spare[part.owner[chosen[i]]]]
+            best = min(fewer, key=u, default=chosen)
+            if best is chosen or u(best) > target:
+                break
+            chosen = best
+        return tried[chosen].tolist()
+
+    def ten(self, known: Candidates, ahead: Sequence[int]) -> Float[np.ndarray, "P P"]:
+        """The information after the ten best of the poses ahead, or after all and further ones."""
+        rows = np.array(ahead, dtype=int)
+        part = known._replace(rows=known.rows[rows], owner=known.owner[rows])
+        first = rows[self.chosen(part, min(TEN, len(rows)))]
+        return known.information(known.rows[self.chosen(known, TEN, first.tolist())])
+
+    def _pool(self, sets: Sequence[Observations], session: str, probe: str) -> Pool:
+        q, places, parts, prefix = [], [], [], f"{session}/" if session else ""
+        columns: dict[str, np.ndarray] = {}
+        for own in sets:
+            q += [np.asarray(part.q) for part in own]
+            places += [self._names[name] for part in own for name in _places_of(part)]
+            parts_here = [part.in_session(session, probe) for part in own] if session else own
+            ends = {part.name for part in parts_here if part.kind == "socket"}
+            lengths = [
+                ReferenceLength(prefix + length.start, prefix + length.end, length.value, length.u)
+                for length in self.setup.lengths
+                if {prefix + length.start, prefix + length.end} <= ends
+            ]
+            parts.append(candidates_of_kit(self.problem, parts_here, lengths))
+            positions = Observed.of(Capture({}, lengths, parts_here), self.problem.arm).positions
+            columns = {name: len(self.problem.space.names) + at for name, at in positions.items()}
+        most = max(part.rows.shape[1] for part in parts)
+        rows = [np.pad(part.rows, ((0, 0), (0, most - part.rows.shape[1]), (0, 0))) for part in parts]
+        candidates = parts[0]._replace(rows=np.concatenate(rows), owner=np.array(places))
+        return Pool(np.concatenate(q), np.array(places), candidates, columns)
+
+    def _stated(self, drawn: Observations) -> tuple[list[AbstractObservation], list[int]]:
+        """The poses that were planned, in each thing, one that was drawn where there are none; and their numbers."""
+        stated, numbers, first = [], list[int](), 0
+        for thing, part in zip(self.things.values(), drawn, strict=True):
+            rows = {name: row for row, name in enumerate(_places_of(part))}
+            poses = [(q, rows[place]) for place, q in self.setup.planned if place in rows]
+            numbers += range(first, first + len(poses))
+            q = np.array([q for q, _ in poses] or np.asarray(part.q)[:1])
+            stated.append(thing.recorded(self.problem.region, q, part.select([row for _, row in poses] or [0])))
+            first += len(q)
+        return stated, numbers
+
+    def _near(self, parts: Observations) -> list[AbstractObservation]:
+        """Other poses near to the planned ones, which are the first candidates, in each thing."""
+        near, first = [], 0
+        for thing, part in zip(self.things.values(), parts, strict=True):
+            chosen, first = np.array(self.planned) - first, first + len(part.q)
+            rows = chosen[(chosen >= 0) & (chosen < len(part.q))]
+            poses = part.select(np.sort(rows) if len(rows) else np.array([0]))
+            around = neighbours(self.problem, thing, poses)
+            same = (np.asarray(around.q)[:, None] == np.asarray(poses.q)).all(axis=2).any(axis=1)
+            near.append(around.select(np.flatnonzero(~same)) if not same.all() else poses)
+        return near
+
+
+def _places_of(poses: AbstractObservation) -> list[str]:
+    """Name of the place of each pose."""
+    label = label_of(poses)
+    return [f"{poses.name}/{point}" for point in poses.stored()[label]] if label else [poses.name] * len(poses.q)

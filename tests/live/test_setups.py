@@ -1,0 +1,147 @@
+"""Live captures from files, and the command in a terminal."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+
+KIT = """
+[[artefact]]
+name = "bar"
+points = { 1 = [0, 0, 0], 2 = [300, 0, 0] }
+frame = [0, 0, 0.7, 300, -200, 300]
+u = 0.001
+poses = 4
+places = 2
+[[socket]]
+name = "A"
+point = [400, 200, 300]
+poses = 4
+[[points]]
+name = "tracker"
+box = [[200, -300, 100], [600, 300, 500]]
+u = 0.02
+"""
+MANIFEST = """
+arm = "cheng2018-simulation"
+[[socket]]
+name = "A"
+file = "A.csv"
+[[socket]]
+name = "B"
+file = "B.csv"
+[[artefact]]
+name = "plate"
+files = { 1 = "1.csv", 2 = "2.csv", 3 = "3.csv" }
+coordinates = { 1 = [0, 0, 0], 2 = [100, 0, 0], 3 = [0, 100, 0] }
+u = 0.002
+[[length]]
+from = "A"
+to = "B"
+value = 500.01
+u = 0.002
+"""
+HEADER = "pose,move,observation,point,x_mm,y_mm,z_mm," + ",".join(f"q_{i}_deg" for i in range(1, 7))
+ROWS = [("A", "", 400, 0, 300), ("B", "", 400, 500, 300)]
+ROWS += [("plate", str(i), x, y, 200) for i, x, y in ((1, 300, 100), (2, 300, 200), (3, 200, 100))]
+
+
+def plan(folder):
+    lines = [HEADER]
+    for i, row in enumerate(ROWS, start=1):
+        for move in ("approach", "pose"):
+            lines.append(",".join(map(str, (i, move, *row, *range(i, i + 6)))))
+    (folder / "plan.toml").write_text(MANIFEST)
+    (folder / "plan.csv").write_text("\n".join(lines))
+    return folder / "plan.toml"
+
+
+def test_the_places_of_a_kit(tmp_path):
+    (tmp_path / "kit.toml").write_text(KIT)
+    setup = aj.live.read_setup("cheng2018-simulation", kit=tmp_path / "kit.toml")
+    names = ["bar/1/1", "bar/1/2", "bar/2/1", "bar/2/2", "tracker", "A"]
+    assert sorted(place.name for place in setup.places) == sorted(names)
+    assert setup.place("bar/1/2").position is None  # where it is put up is found by touching
+    assert setup.place("tracker").is_free
+    assert not setup.place("A").is_free
+
+
+def test_the_places_and_poses_of_a_plan(tmp_path):
+    setup = aj.live.read_setup("cheng2018-simulation", plan=plan(tmp_path))
+    assert [name for name, _ in setup.planned] == ["A", "B", "plate/1", "plate/2", "plate/3"]
+    np.testing.assert_allclose(np.degrees(setup.planned[1][1]), np.arange(2, 8))
+    for name, point, *position in ROWS:
+        place = setup.place(f"{name}/{point}" if point else name)
+        np.testing.assert_allclose(place.position, position, atol=1e-9)
+    assert [(length.start, length.end, float(length.value)) for length in setup.lengths] == [("A", "B", 500.01)]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda plan: plan.with_suffix(".csv").unlink(), "plan.csv is missing"),
+        (lambda plan: plan.with_suffix(".csv").write_text("pose,x_mm\n1,2\n"), "no columns q_1_deg"),
+        (lambda plan: plan.write_text(MANIFEST.replace('name = "B"', 'name = "C"')), "no pose in 'C'"),
+        (lambda plan: plan.write_text(MANIFEST + '[[transforms]]\nname = "T"\nfile = "t.csv"\n'), "--kit"),
+    ],
+)
+def test_plans_that_do_not_fit_are_refused(tmp_path, change, says):
+    change(plan(tmp_path))
+    with pytest.raises(aj.InputError, match=says):
+        aj.live.read_setup("cheng2018-simulation", plan=tmp_path / "plan.toml")
+
+
+def test_instruments_and_sessions_make_a_capture(tmp_path):
+    (tmp_path / "kit.toml").write_text(KIT.replace("places = 2\n", ""))
+    setup = aj.live.read_setup("cheng2018-simulation", kit=tmp_path / "kit.toml")
+    random, poses = np.random.default_rng(0), []
+    for number, place in enumerate(["A", "tracker", "bar/2", "A", "bar/1", "tracker", "tracker", "A"], start=1):
+        measured = {"points": random.normal(size=3)} if place == "tracker" else {}
+        q = random.normal(size=6)
+        poses.append(aj.live.TakenPose(number, place, 0.0, q, q, {}, measured, session=1 + (number > 6)))
+    poses.append(poses[0]._replace(number=9))  # the same readings again
+    poses.append(poses[0]._replace(number=10, q=np.zeros(6), excluded=True))
+    capture, numbers = aj.live.capture_of(setup, poses)
+    rows = np.asarray(capture.readings)
+    by_number = {pose.number: pose.q for pose in poses}
+    assert sorted(numbers) == [1, 2, 3, 4, 5, 6, 7, 8]
+    for row, number in zip(rows, numbers, strict=True):
+        np.testing.assert_array_equal(row, by_number[number])
+    tracker = next(part for part in capture.observations if part.name == "session 1/tracker")
+    np.testing.assert_array_equal(tracker.points, [poses[1].measured["points"], poses[5].measured["points"]])
+    with pytest.raises(aj.InputError, match="has no measured point"):
+        aj.live.capture_of(setup, [poses[1]._replace(measured={})])
+
+
+@pytest.mark.slow
+def test_the_command_in_a_terminal(tmp_path):
+    (tmp_path / "kit.toml").write_text(KIT.replace("places = 2\n", "").partition("[[points]]")[0])
+    command = [sys.executable, "-m", "aacmm_jax", "live", "cheng2018-simulation", "--terminal", "--kit", "kit.toml"]
+    command += ["--device", "simulated:?speed=20", "-o", "c.h5", "--capture-only"]
+    process = subprocess.Popen(
+        command, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline() == "pose 1 in bar/1\n"
+    output, errors = process.communicate("f", timeout=120)
+    assert process.returncode == 0, errors
+    assert "written: c.h5" in output
+    assert aj.files.load_capture(tmp_path / "c.h5").nominal.arm.joints == 6
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--kit", "absent.toml"], "absent.toml"),
+        ([], "give either a plan"),
+        (["--kit", "kit.toml", "--plan", "kit.toml"], "give either a plan"),
+    ],
+)
+def test_wrong_options_are_one_sentence(tmp_path, arguments, says):
+    (tmp_path / "kit.toml").write_text(KIT)
+    options = zip(arguments[::2], arguments[1::2], strict=True)
+    given = {name.removeprefix("--"): tmp_path / file for name, file in options}
+    with pytest.raises(aj.InputError, match=says):
+        aj.live.read_setup("cheng2018-simulation", **given)
