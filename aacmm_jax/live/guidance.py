@@ -17,6 +17,7 @@ from ..calibration.evaluation import fit_geometry
 from ..calibration.scale_anchor import fixes_scale
 from ..calibration.task import without_lengths
 from ..core.distributions import f_tail, student_quantile
+from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..kinematics.arm import Arm
@@ -44,6 +45,7 @@ _OPEN = 1e-3  # eigenvalue of I - H below which nothing else shows an error of t
 _LEAST_U = 1e-4  # mm: smallest standard uncertainty of what is certified
 _ROUNDS = 3  # of leaving out poses
 _OTHER_PLACE = 1.0  # rad: what a change of place counts besides its motion
+_HERE = 0.15  # rad, summed over joints: nearer than this the arm stands where the pose would be taken
 _MOVES = 6  # that are checked for collisions
 
 
@@ -110,10 +112,10 @@ class Guide:
         self._weights = joint_weights(arm) / np.broadcast_to(reading_units(arm.geometry), (arm.joints,))
 
     def calibrated(self, poses: Sequence[TakenPose]) -> Guidance | None:
-        """The calibration of the poses so far; None where there are none.
+        """The calibration of the poses so far; None where there are none, or the first ones determine none.
 
         Raises:
-            InputError: A pose lacks what was to be measured, or the solve is impossible.
+            InputError: A pose lacks what was to be measured, or the solve has become impossible.
         """
         poses = [pose for pose in poses if not pose.excluded]
         if not poses:
@@ -121,13 +123,18 @@ class Guide:
             return None
         numbers = {pose.number for pose in poses}
         wrong, newest = self._wrong & numbers, max(numbers)
-        for _ in range(_ROUNDS):
+        try:
             solution = self._solved(poses, wrong)
+        except InputError:
+            if self._start is not None:
+                raise
+            self._drop_taken(max(poses, key=lambda pose: pose.number))  # the first poses determine no calibration yet
+            return None
+        for _ in range(_ROUNDS):
             outliers = solution.outliers(newest)
             if outliers == wrong:
                 break
             wrong = outliers
-        else:
             solution = self._solved(poses, wrong)
         self._wrong = wrong
         return self._guidance(poses, solution)
@@ -144,7 +151,11 @@ class Guide:
                 again.place, again.q, f"Pose {again.number} is {away:.2g} mm off: take it again.", q, None
             )
         pool = self.search.pool()
-        known, ahead = (pool.candidates, self.search.planned) if guidance is None else (guidance.known, guidance.ahead)
+        known, ahead = (
+            (pool.candidates, self._ahead or self.search.planned)
+            if guidance is None
+            else (guidance.known, guidance.ahead)
+        )
         here = place if place is not None else None if guidance is None else guidance.last
         index = next((i for i, at in enumerate(self.setup.places) if at.name == here), -1)
         rows = np.array(ahead, dtype=int)
@@ -168,6 +179,8 @@ class Guide:
         if now is None:
             return int(rows[0]), 0.0
         away = np.abs((q[rows] - now) * self._weights).sum(axis=1)
+        if np.any(away > _HERE):  # where the arm stands it has just been
+            rows, away = rows[away > _HERE], away[away > _HERE]
         order = np.argsort(away + _OTHER_PLACE * (known.owner[rows] != here))
         first = rows[order[:_MOVES]]
         contacts = move_contacts(self.search.problem.region, np.tile(now, (len(first), 1)), q[first])
@@ -229,7 +242,7 @@ class Guide:
 
     def _guidance(self, poses: Sequence[TakenPose], solution: "_Solution") -> Guidance:
         newest = max(poses, key=lambda pose: pose.number)
-        self._drop_taken(newest, solution)
+        self._drop_taken(newest)
         used = [pose for pose in poses if pose.number not in self._wrong and pose.session == newest.session]
         counts = np.array([sum(pose.place == place.name for pose in used) for place in self.setup.places])
         found = progress(
@@ -259,7 +272,7 @@ class Guide:
             for pose in wrong
         ]
 
-    def _drop_taken(self, newest: TakenPose, solution: "_Solution") -> None:
+    def _drop_taken(self, newest: TakenPose) -> None:
         """Take from the plan the pose that was taken, or else the one that is worth least."""
         if newest.number <= self._newest or newest.number in self._wrong or not self._ahead:
             self._newest = max(newest.number, self._newest)

@@ -181,3 +181,33 @@ def test_a_page_without_the_token_shows_nothing_and_one_whose_session_ended_says
         page.wait_for_selector("body:not(.lost)")
         page.keyboard.press(" ")
         page.wait_for_function(ROWS, arg=6)
+
+
+FOREIGN = """async ([address, token]) => {
+    const results = [], body = '{"action": "take"}', url = `${address}/do`;
+    const attempts = [
+        { method: "POST", mode: "no-cors", body },
+        { method: "POST", body, headers: { "Content-Type": "application/json", "X-Token": token } },
+        { method: "POST", mode: "no-cors", body, credentials: "include" },
+    ];
+    for (const attempt of attempts) {
+        results.push(await fetch(url, attempt).then((answer) => answer.type, () => "refused"));
+    }
+    const state = { headers: { "X-Token": token } };
+    results.push(await fetch(`${address}/state`, state).then(() => "read", () => "refused"));
+    const frame = document.createElement("iframe");
+    frame.src = `${address}/#${token}`;
+    document.body.append(frame);
+    await new Promise((resolve) => { frame.onload = resolve; setTimeout(resolve, 3000); });
+    return results;
+}"""
+
+
+def test_a_foreign_page_commands_and_reads_nothing_even_with_the_token(shown):
+    session = StubSession()
+    with serving(session) as address:
+        place, token = address.split("/#")
+        foreign = shown("data:text/html,<title>foreign</title><body></body>", ready=False)
+        assert foreign.evaluate(FOREIGN, [place, token]) == 4 * ["refused"]
+        assert all(frame.url.startswith(("data:", "about:", "chrome-error:")) for frame in foreign.frames)
+        assert session.asked == []

@@ -238,6 +238,8 @@ function everything() {
 function taken() {
   const last = state.poses.at(-1);
   if (sounds !== null && state.sound > sounds && last) {
+    chosen = null;
+    poses();
     beep(last.outlier);
     $("now").classList.remove("flash");
     requestAnimationFrame(() => $("now").classList.add("flash"));
