@@ -11,7 +11,6 @@ import typer
 from .. import files, kinematics, summaries
 from ..core.errors import InputError
 from ..core.text import printable, shorten
-from ..files.controllers import ZERO_FILES
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import check_kept, together, write_text
 from . import options
@@ -64,7 +63,8 @@ def export(
     | None = option(
         "toml: arm file; json: complete summary; csv: parameters; dcc: Digital Calibration Certificate (XML); urdf, "
         "mjcf: the URDF or MJCF of the nominal arm, with calibrated origins; table: D-H table (CSV); offsets: "
-        "refitted zero offsets of the joints only; ur: kinematics.yaml of Universal Robots; python: a program that "
+        "refitted zero offsets of the joints only, for controllers that can master an axis at a stated reading (ABB, "
+        "FANUC, Staeubli and others); ur: kinematics.yaml of Universal Robots; python: a program that "
         "needs only NumPy; "
         "camera-info: intrinsics of a camera (ROS, YAML); joint-origin, static-transform, opencv, matrix: frame of a "
         "camera or target, as the fixed joint of a URDF, a command of ROS 2, YAML of OpenCV, or 4 x 4 matrix (mm); "
@@ -200,6 +200,8 @@ def _zero_offsets(record: Any) -> Any:
 
 def _zeros_in_file(record: Any, form: str, file: Path | None, motors: str | None) -> tuple[str, list[str]]:
     """A controller's file with the zero offsets, and what they leave."""
+    from ..files.controllers import ZERO_FILES
+
     zeros, source = _zero_offsets(record), record.recording.nominal.urdf
     if file is None:
         if source is None:

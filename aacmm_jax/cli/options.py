@@ -47,7 +47,8 @@ ONLY = option("Use only the sockets whose names match this shell pattern; may be
 WITHOUT = option("Leave out the sockets whose names match this shell pattern; may be given several times.", "PATTERN")
 CALIBRATION_FILE = argument("Calibration, written by aacmm calibrate.", "CALIBRATION.h5")
 NOMINAL_ARM = argument(
-    "Nominal arm: a TOML file, URDF, MJCF (.xml), kinematics.yaml, or the name of an arm that ships with aacmm.",
+    "Nominal arm: a TOML file, URDF, MJCF (.xml), kinematics.yaml or calibration.conf (Universal Robots), or the name "
+    "of an arm that ships with aacmm.",
     "ARM",
 )
 ABOUT = option("Administrative data of a certificate: laboratory, customer, item, persons, dates.", "FILE.toml")

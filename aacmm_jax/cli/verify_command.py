@@ -25,8 +25,9 @@ def verify(
         "CAPTURE.h5|MANIFEST.toml",
     ),
     delivered: str | None = option(
-        "Arm with the parameters that the maker or controller states: a kinematics.yaml, a URDF, an MJCF, or a TOML "
-        "file with D-H parameters and zero offsets. Default: as_found of the manifest.",
+        "Arm with the parameters that the maker or controller states: a kinematics.yaml or calibration.conf (Universal "
+        "Robots), a URDF, an MJCF, or a TOML file with D-H parameters and zero offsets. Default: as_found of the "
+        "manifest.",
         "ARM",
     ),
     base: str | None = options.BASE_LINK,

@@ -9,7 +9,7 @@ import contextlib
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,9 +19,21 @@ from jaxtyping import Float
 from pydantic import Field, FiniteFloat, NonNegativeFloat, PositiveFloat
 
 from ..core.errors import InputError, naming
+from ..kinematics.arm import Arm
 from ..kinematics.axes_to_dh import Transform, dh_frames, geometry_of, inverse
-from ..kinematics.collisions import Body, Box, Cell, HalfSpace, Post, body_along_links, check_obstacle, segment_distance
-from ..kinematics.parameters import ArmSpecification, UrdfSource
+from ..kinematics.collisions import (
+    Body,
+    Box,
+    Cell,
+    HalfSpace,
+    Post,
+    body_along_links,
+    body_of_chains,
+    check_obstacle,
+    segment_distance,
+)
+from ..kinematics.parameters import UrdfSource
+from ..kinematics.robots import ChainOf
 from ..kinematics.workspace import total_link_length
 from .arms import load_specification, urdf_folder
 from .inputs import InputFile
@@ -120,7 +132,7 @@ def load_cell(
         specification, notes = load_specification(arm, base=base, tip=tip), ()
         slender, body = _SLENDER * total_link_length(specification.arm), None
         if radius is None and specification.urdf is not None:
-            body, notes = _urdf_body(specification, specification.urdf, urdf_folder(arm), slender)
+            body, notes = _urdf_bodies(specification.arm, specification.urdf, urdf_folder(arm), slender)
         if body is None:
             if radius is None:
                 notes = (
@@ -143,19 +155,36 @@ class _Row(NamedTuple):
     radius: float
 
 
+def _urdf_bodies(arm: Arm, urdf: UrdfSource, folder: Path, radius: float) -> tuple[Body | None, tuple[str, ...]]:
+    """`_urdf_body` of an arm, or of all chains of a robot."""
+    if not arm.chains:
+        return _urdf_body(arm, urdf, folder, radius)
+    sources = [urdf._replace(tips=(tip,)) for tip, _ in arm.chains]
+    stops = {joint.name for source in sources for joint in urdf_chain(source, alone=False).joints}
+    notes: dict[str, None] = {}
+
+    def body_of(chain: ChainOf) -> Body:
+        body, said = _urdf_body(chain.arm, sources[chain.number], folder, radius, stops)
+        notes.update(dict.fromkeys(said))
+        return body_along_links(chain.arm, radius) if body is None else body
+
+    return body_of_chains(arm, body_of), tuple(notes)
+
+
 def _urdf_body(
-    specification: ArmSpecification, urdf: UrdfSource, folder: Path, radius: float
+    arm: Arm, urdf: UrdfSource, folder: Path, radius: float, stops: Iterable[str] = ()
 ) -> tuple[Body | None, tuple[str, ...]]:
     """Capsules about the collision shapes of the links between base and tip, side branches at reading 0; and notes.
 
     Links whose meshes are not at hand have capsules of this ``radius``, mm, about the lengths of their D-H row instead,
-    and so has a probe beyond the tip. No body where the URDF has no collision shapes on these links.
+    and so has a probe beyond the tip. Beyond joints of other chains, the ``stops``, no link is carried. No body
+    where the URDF has no collision shapes on these links.
     """
-    chain = urdf_chain(urdf)
+    chain = urdf_chain(urdf, alone=not stops)
     shapes, frames = collision_shapes(chain.robot), dh_frames(geometry_of(chain.arm), chain.base)
     rows: list[_Row] = []
     missing: dict[int, str] = {}
-    for number, link, link_frame in chain.carried_links(urdf.base):
+    for number, link, link_frame in chain.carried_links(urdf.base, stops):
         for count, shape in enumerate(shapes.get(link, ()), start=1):
             capsule = _capsule(shape, inverse(frames[number]) @ link_frame @ shape.origin, folder)
             if capsule is None:
@@ -166,8 +195,8 @@ def _urdf_body(
             rows.append(_Row(name, number, start, number, end, width))
     if not rows and not missing:
         return None, ()
-    simple, with_shape = body_along_links(specification.arm, radius), {row.end_frame for row in rows}
-    tool = np.linalg.norm(np.asarray(specification.arm.probe) - np.asarray(chain.arm.probe)) > 0
+    simple, with_shape = body_along_links(arm, radius), {row.end_frame for row in rows}
+    tool = np.linalg.norm(np.asarray(arm.probe) - np.asarray(chain.arm.probe)) > 0
     rows = [row for row in rows if not any(_holds(other, row) for other in rows)]
     for row in map(_Row._make, zip(*simple[:-1], strict=True)):
         if (row.name == "probe" and tool) or (row.end_frame in missing and row.end_frame not in with_shape):

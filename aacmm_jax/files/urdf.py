@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from functools import reduce
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
@@ -65,10 +65,11 @@ class UrdfChain(NamedTuple):
         """The tip link in the frame of the last joint, mm."""
         return self.tip_before if self.tip_joint is None else self.tip_before @ self.tip_joint.origin
 
-    def carried_links(self, base: str) -> Iterator[tuple[int, str, Transform]]:
-        """The links that the base link (0) and each joint carry up to the next joint, side branches included: number of
-        the joint, name of the link, and its frame in the base link at reading 0."""
-        stops, frame = {joint.name for joint in self.joints}, np.eye(4)
+    def carried_links(self, base: str, stops: Iterable[str] = ()) -> Iterator[tuple[int, str, Transform]]:
+        """The links that the base link (0) and each joint carry up to the next joint, side branches included but for
+        those of joints that are ``stops``: number of the joint, name of the link, and its frame in the base link at
+        reading 0."""
+        stops, frame = {joint.name for joint in self.joints} | set(stops), np.eye(4)
         starts = [base, *(joint.child for joint in self.joints)]
         for number, (start, origin) in enumerate(zip(starts, [np.eye(4), *self.origins], strict=True)):
             frame = frame @ origin

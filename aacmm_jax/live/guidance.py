@@ -45,7 +45,7 @@ _OPEN = 1e-3  # eigenvalue of I - H below which nothing else shows an error of t
 _LEAST_U = 1e-4  # mm: smallest standard uncertainty of what is certified
 _ROUNDS = 3  # of leaving out poses
 _OTHER_PLACE = 1.0  # rad: what a change of place counts besides its motion
-_HERE = 0.15  # rad, summed over joints: nearer than this the arm stands where the pose would be taken
+_HERE = 0.15  # rad, summed over joints: nearer than this a pose is the one that was taken last
 _MOVES = 6  # that are checked for collisions
 
 
@@ -104,6 +104,7 @@ class Guide:
         self.setup, self.target = setup, target
         self.search = Search(setup, options)
         self._wrong: frozenset[int] = frozenset()
+        self._last: Float[np.ndarray, " n"] | None = None  # readings of the newest pose
         self._newest, self._start, self._ahead = 0, None, list(self.search.planned)
         arm, given = self.search.problem.arm, setup.specification
         usual = {} if arm.corrections is None else {k: float(v) for k, v in default_prior(arm).sd.items()}
@@ -115,9 +116,10 @@ class Guide:
         """The calibration of the poses so far; None where there are none, or they determine none yet."""
         poses = [pose for pose in poses if not pose.excluded]
         if not poses:
-            self._ahead = list(self.search.planned)
+            self._ahead, self._last = list(self.search.planned), None
             return None
         last = max(poses, key=lambda pose: pose.number)
+        self._last = last.q[: len(self._weights)]
         wrong = self._wrong & {pose.number for pose in poses}
         # Poses that do not determine where their thing stands wait for others in it, those of the last pose first.
         waiting = [pose for pose in poses if self._thing(pose) == self._thing(last)]
@@ -181,8 +183,9 @@ class Guide:
         if now is None:
             return int(rows[0]), 0.0
         away = np.abs((q[rows] - now) * self._weights).sum(axis=1)
-        if np.any(away > _HERE):  # where the arm stands it has just been
-            rows, away = rows[away > _HERE], away[away > _HERE]
+        if self._last is not None:  # what was just taken is not worth taking again
+            apart = np.abs((q[rows] - self._last) * self._weights).sum(axis=1) > _HERE
+            rows, away = (rows[apart], away[apart]) if np.any(apart) else (rows, away)
         order = np.argsort(away + _OTHER_PLACE * (known.owner[rows] != here))
         first = rows[order[:_MOVES]]
         contacts = move_contacts(self.search.problem.region, np.tile(now, (len(first), 1)), q[first])

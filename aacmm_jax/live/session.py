@@ -354,13 +354,16 @@ class Session:
             self._wake.clear()
             with self._lock:
                 poses, q, forced = list(self._captured.poses), self._q, self._forced
+            found, proposed, message = None, None, ""
             try:
                 guide = guiding.Guide(self.setup, self.target) if guide is None else guide
-                found = guide.calibrated(poses)
+                try:
+                    found = guide.calibrated(poses)
+                except InputError as error:  # of data that do not determine enough yet
+                    message = str(error)
                 proposed = guide.next_pose(found, q, forced)
-                message = ""
             except Exception as error:  # poses are taken without guidance, too
-                found, proposed, message = None, None, in_words(error)
+                message = in_words(error)
             with self._lock:
                 self._where = Whereabouts(self.setup, self._arm, self._captured.poses, found)
                 self._next, self._message = proposed, message

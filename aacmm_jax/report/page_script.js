@@ -105,7 +105,8 @@
       ...poses.flatMap((p) => [...p.points, ...p.carried])];
     const middle = [0, 1, 2].map((i) => (Math.min(...all.map((p) => p[i])) + Math.max(...all.map((p) => p[i]))) / 2);
     const extent = Math.max(...all.map((p) => Math.hypot(...p.map((x, i) => x - middle[i]))), 1);
-    const shadows = poses.filter((_, i) => i % Math.max(1, Math.ceil(poses.length / 24)) === 0);
+    // Not every so many: the chains of a robot may take turns.
+    const shadows = poses.filter((_, i) => (0.618034 * i) % 1 < 24 / poses.length);
 
     function add(name, attributes, text) {
       const node = document.createElementNS(SVG, name);

@@ -16,7 +16,7 @@ from ..core.units import ARCSEC, DEG, M
 from ..data.capture import Capture
 from ..data.recording import Recording
 from ..files.arms import specification_toml
-from ..kinematics.arm import Arm, correction_names, joint_limits, without_corrections
+from ..kinematics.arm import Arm, correction_names, joint_limits, one_chain, without_corrections
 from ..kinematics.parameters import ArmSpecification, Parameters, single
 from ..kinematics.priors import Prior
 from ..model.observed import Observed
@@ -95,7 +95,7 @@ class Study:
     """
 
     def __init__(self, specification: Specification, nominal: ArmSpecification, recording: Recording | None = None):
-        single(nominal.arm)
+        one_chain(single(nominal.arm), "a study")
         self.specification, self.nominal, self.recording = specification, _picklable(nominal), recording
         if recording is not None:
             true = None if recording.true is None else _picklable(recording.true)

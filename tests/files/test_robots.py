@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.files.arms import specification_toml
+from aacmm_jax.kinematics.collisions import capsule_ends
 from aacmm_jax.kinematics.parameters import ArmSpecification
 
 LIMIT = '<limit lower="-2" upper="2"/>'
@@ -183,3 +185,62 @@ def test_bad_files_are_refused_in_one_sentence(tmp_path, what):
     with pytest.raises(aj.InputError, match=words) as error:
         aj.load_arm(tmp_path / "bad.urdf", **options)
     assert "\n" not in str(error.value)
+
+
+def test_the_body_of_a_robot_has_the_collision_shapes_of_all_chains_once(tmp_path):
+    shape = '<collision><geometry><sphere radius="0.05"/></geometry></collision>'
+    path = tmp_path / "two.urdf"
+    links = ("trunk", *(f"{side}{part}" for side in ("left", "right") for part in "abc"))
+    text = ROBOT
+    for link in links:
+        text = text.replace(f'<link name="{link}"/>', f'<link name="{link}">{shape}</link>')
+    path.write_text(text)
+    tips = ["left_tool", "right_tool"]
+    robot, body = to_numpy(aj.load_arm(path, tip=tips)), aj.files.load_cell(path, tip=tips).cell.body
+    assert sorted(body.names) == sorted(links)
+    pairs = {frozenset((body.names[i], body.names[j])) for i, j in body.pairs}
+    assert frozenset(("lefta", "rightc")) in pairs
+    assert frozenset(("lefta", "leftb")) not in pairs
+    q = readings(robot)
+    start, _ = capsule_ends(body, robot, q)
+    for tip, links in (("left_tool", ("trunk", "lefta", "leftc")), ("right_tool", ("trunk", "rightb"))):
+        own = aj.files.load_cell(path, tip=tip).cell.body
+        plain, chain = to_numpy(aj.load_arm(path, tip=tip)), aj.kinematics.chain_of(robot, tip)
+        alone, _ = capsule_ends(own, plain, chain.of_robot(q))
+        for link in links:
+            np.testing.assert_allclose(start[body.names.index(link)], alone[own.names.index(link)], atol=1e-9)
+
+
+CONTACTS = """
+arm = "two.urdf"
+tip = ["left_tool", "right_tool"]
+angles = { unit = "rad", columns = ["q_1", "q_2", "q_3", "q_4"] }
+[[socket]]
+file = "left.csv"
+group = "contact"
+chain = "left_tool"
+[[contact_sphere]]
+name = "ball"
+file = "right.csv"
+columns = { socket = "contact" }
+chain = "right_tool"
+diameter = 30.0
+stylus = 6.0
+"""
+
+
+def test_contacts_of_a_manifest_name_the_sockets_of_the_other_chain(urdf, tmp_path):
+    q = np.random.default_rng(0).uniform(-1, 1, (6, 4))
+    rows = [",".join([f"c{i}", *map(str, row)]) for i, row in enumerate(q.tolist())]
+    for side in ("left", "right"):
+        (tmp_path / f"{side}.csv").write_text("\n".join(["contact,q_1,q_2,q_3,q_4", *rows]))
+    (tmp_path / "m.toml").write_text(CONTACTS)
+    recording = aj.files.read_manifest(tmp_path / "m.toml")
+    aj.files.save_capture(tmp_path / "c.h5", recording)
+    capture = aj.files.load_capture(tmp_path / "c.h5").capture
+    (contact,) = capture.observations
+    assert contact.kind == "sphere contact"
+    assert contact.socket == tuple(f"c{i}" for i in range(6)) == tuple(capture.sockets)
+    assert {int(q[0, -1]) for q in capture.sockets.values()} == {0}
+    assert set(np.asarray(contact.q)[:, -1]) == {1.0}
+    assert contact.radius == 18.0

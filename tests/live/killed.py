@@ -8,7 +8,9 @@ from typing import TextIO
 import numpy as np
 
 import aacmm_jax as aj
+from aacmm_jax.live import guidance
 from aacmm_jax.live.devices.device import AbstractDevice
+from tests.live.unguided import NoGuide
 
 
 def setup():
@@ -37,7 +39,7 @@ class Hasty(AbstractDevice):
 
     def read(self):
         goal = self.poses[self.random.integers(len(self.poses))]
-        path = [goal + 0.3 * (1 - i / 30) for i in range(30)] + [goal] * 60
+        path = [goal + 0.3 * (1 - i / 30) for i in range(30)] + [goal] * 150
         samples = []
         for q in path:
             self.time += 0.01
@@ -46,7 +48,8 @@ class Hasty(AbstractDevice):
 
 
 def capture(path: str, seed: int, out: TextIO) -> None:
-    """Capture until killed; says "ready" and each pose."""
+    """Capture until killed, without guidance; says "ready" and each pose."""
+    guidance.Guide = NoGuide
     with aj.live.Session(setup(), [Hasty(seed)], path=path) as session:
         told = {pose["number"] for pose in session.state()["poses"]}
         print("ready", file=out, flush=True)

@@ -161,6 +161,7 @@ def fed(source, tmp_path, count, **options):
 
 @pytest.mark.parametrize("kind", [Pty, Server])
 @pytest.mark.slow
+@pytest.mark.usefixtures("unguided")
 def test_no_pose_is_lost_or_doubled_and_every_bad_line_is_counted(kind, tmp_path):
     source = kind(tmp_path)
     state, feeder, _ = fed(source, tmp_path, 12)

@@ -15,6 +15,7 @@ from aacmm_jax.live.devices.device import AbstractDevice
 from aacmm_jax.live.journal import Journal, journal_of
 from tests.live import killed
 
+pytestmark = pytest.mark.usefixtures("unguided")
 SETUP = killed.setup()
 ARM = SETUP.specification.arm
 
@@ -34,7 +35,7 @@ class Scripted(AbstractDevice):
         self.lines += len(samples)
         return samples
 
-    def hold(self, q, seconds=1.2, **columns):
+    def hold(self, q, seconds=1.8, **columns):
         """Move to a pose and hold it; waits until all was read."""
         path = [np.asarray(q) + 0.2 * (1 - i / 20) for i in range(20)] + [np.asarray(q)] * int(100 * seconds)
         samples = []
@@ -220,8 +221,9 @@ def killed_at_random(folder: Path, kills: int, seed: int) -> dict[str, int]:
     """Kill a capture and continue it, so many times; every pose that it told must be in the journal, once."""
     path, told, dropped, moment = folder / "c.h5", {}, 0, random.Random(seed)
     for kill in range(kills):
-        command = [sys.executable, killed.__file__, str(path), str(kill)]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        command = [sys.executable, "-m", killed.__name__, str(path), str(kill)]
+        root = Path(killed.__file__).parents[2]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=root)
         assert process.stdout.readline() == "ready\n"
         time.sleep(moment.uniform(0.05, 2.5))
         process.kill()
