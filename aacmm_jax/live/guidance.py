@@ -45,7 +45,7 @@ _OPEN = 1e-3  # eigenvalue of I - H below which nothing else shows an error of t
 _LEAST_U = 1e-4  # mm: smallest standard uncertainty of what is certified
 _ROUNDS = 3  # of leaving out poses
 _OTHER_PLACE = 1.0  # rad: what a change of place counts besides its motion
-_HERE = 0.15  # rad, summed over joints: nearer than this the arm stands where the pose would be taken
+_HERE = 0.15  # rad, summed over joints: nearer than this a pose is the one that was taken last
 _MOVES = 6  # that are checked for collisions
 
 
@@ -104,6 +104,7 @@ class Guide:
         self.setup, self.target = setup, target
         self.search = Search(setup, options)
         self._wrong: frozenset[int] = frozenset()
+        self._last: Float[np.ndarray, " n"] | None = None  # readings of the newest pose
         self._newest, self._start, self._ahead = 0, None, list(self.search.planned)
         arm, given = self.search.problem.arm, setup.specification
         usual = {} if arm.corrections is None else {k: float(v) for k, v in default_prior(arm).sd.items()}
@@ -112,24 +113,27 @@ class Guide:
         self._weights = joint_weights(arm) / np.broadcast_to(reading_units(arm.geometry), (arm.joints,))
 
     def calibrated(self, poses: Sequence[TakenPose]) -> Guidance | None:
-        """The calibration of the poses so far; None where there are none, or the first ones determine none.
-
-        Raises:
-            InputError: A pose lacks what was to be measured, or the solve has become impossible.
-        """
+        """The calibration of the poses so far; None where there are none, or they determine none yet."""
         poses = [pose for pose in poses if not pose.excluded]
         if not poses:
-            self._ahead = list(self.search.planned)
+            self._ahead, self._last = list(self.search.planned), None
             return None
-        numbers = {pose.number for pose in poses}
-        wrong, newest = self._wrong & numbers, max(numbers)
-        try:
-            solution = self._solved(poses, wrong)
-        except InputError:
-            if self._start is not None:
-                raise
-            self._drop_taken(max(poses, key=lambda pose: pose.number))  # the first poses determine no calibration yet
+        last = max(poses, key=lambda pose: pose.number)
+        self._last = last.q[: len(self._weights)]
+        wrong = self._wrong & {pose.number for pose in poses}
+        # Poses that do not determine where their thing stands wait for others in it, those of the last pose first.
+        waiting = [pose for pose in poses if self._thing(pose) == self._thing(last)]
+        determined, solution = poses, None
+        while solution is None and determined:
+            try:
+                solution = self._solved(determined, wrong)
+            except InputError:
+                determined = [pose for pose in determined if self._thing(pose) != self._thing(waiting[0])]
+                waiting = determined[-1:]
+        if solution is None:
+            self._drop_taken(last)
             return None
+        poses, newest = determined, last.number
         for _ in range(_ROUNDS):
             outliers = solution.outliers(newest)
             if outliers == wrong:
@@ -137,7 +141,7 @@ class Guide:
             wrong = outliers
             solution = self._solved(poses, wrong)
         self._wrong = wrong
-        return self._guidance(poses, solution)
+        return self._guidance(poses, solution, last)
 
     def next_pose(
         self, guidance: Guidance | None, q: Float[np.ndarray, " n"] | None, place: str | None = None
@@ -179,8 +183,9 @@ class Guide:
         if now is None:
             return int(rows[0]), 0.0
         away = np.abs((q[rows] - now) * self._weights).sum(axis=1)
-        if np.any(away > _HERE):  # where the arm stands it has just been
-            rows, away = rows[away > _HERE], away[away > _HERE]
+        if self._last is not None:  # what was just taken is not worth taking again
+            apart = np.abs((q[rows] - self._last) * self._weights).sum(axis=1) > _HERE
+            rows, away = (rows[apart], away[apart]) if np.any(apart) else (rows, away)
         order = np.argsort(away + _OTHER_PLACE * (known.owner[rows] != here))
         first = rows[order[:_MOVES]]
         contacts = move_contacts(self.search.problem.region, np.tile(now, (len(first), 1)), q[first])
@@ -240,8 +245,10 @@ class Guide:
             sd[prior.index] = np.asarray(prior.sd)[prior.index]
         return sd / np.asarray(space.scale)
 
-    def _guidance(self, poses: Sequence[TakenPose], solution: "_Solution") -> Guidance:
-        newest = max(poses, key=lambda pose: pose.number)
+    def _thing(self, pose: TakenPose) -> str:
+        return self.setup.place(pose.place).thing.name
+
+    def _guidance(self, poses: Sequence[TakenPose], solution: "_Solution", newest: TakenPose) -> Guidance:
         self._drop_taken(newest)
         used = [pose for pose in poses if pose.number not in self._wrong and pose.session == newest.session]
         counts = np.array([sum(pose.place == place.name for pose in used) for place in self.setup.places])
@@ -363,9 +370,9 @@ class _Solution(NamedTuple):
         wrong = self.used & (probabilities * len(squares) < _WRONG)
         if wrong.any():
             worst = int(np.argmax(np.where(wrong, ratios, 0.0)))
-            (last,) = np.flatnonzero(self.numbers == newest)
-            if wrong[last] and ratios[last] > _NEWER * ratios[worst]:
-                worst = int(last)
+            last = np.flatnonzero(wrong & (self.numbers == newest))
+            if len(last) and ratios[last[0]] > _NEWER * ratios[worst]:
+                worst = int(last[0])
             still.add(int(self.numbers[worst]))
         return frozenset(still)
 

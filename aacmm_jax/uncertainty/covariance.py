@@ -54,7 +54,9 @@ def inverse_information(
     if not len(information):
         return information, information, fixed
     free = ~fixed
-    information = information + xp.diag(xp.where(fixed, 1.0 + xp.max(xp.abs(information)), 0.0))
+    both = free[:, None] & free[None, :]
+    # What is fixed is known: nothing of it may remain in the equations of the others.
+    information = xp.where(both, information, xp.diag(xp.where(fixed, 1.0 + xp.max(xp.abs(information)), 0.0)))
     # Only masks and a basis come from the eigenvectors: their derivative is infinite where eigenvalues repeat.
     values, vectors = semidefinite_eigen(information)
     informed = values > _NULL * values[0]
@@ -63,7 +65,7 @@ def inverse_information(
     inverse = seen @ inverse_positive_definite(inner) @ seen.T
     undetermined = xp.where((values > _LEAST_INFORMATION)[None, :] & informed[None, :], 0.0, vectors)
     determined = fixed | (xp.sum(undetermined**2, axis=1) < 1e-6)
-    return xp.where(free[:, None] & free[None, :], inverse, 0.0), null @ null.T, determined
+    return xp.where(both, inverse, 0.0), null @ null.T, determined
 
 
 class SharedErrors(eqx.Module):

@@ -225,8 +225,7 @@ def of_active_bounds(
     influence = linear.influence()
     information, shared = influence.information, linear.observed.layout.shared
     on_bound = xp.concatenate([active != 0, xp.zeros(shared, dtype=bool)])
-    inner = xp.where(on_bound[:, None] | on_bound[None, :], 0.0, information)
-    inverse, _, _ = inverse_information(inner, on_bound)
+    inverse, _, _ = inverse_information(information, on_bound)
     # Column i: one step of a parameter on its bound, and what the parameters inside their bounds do to imitate it.
     follow = xp.where(on_bound[:, None], 0.0, -inverse @ information)
     directions = xp.where(on_bound[None, :], xp.asarray(np.eye(p + shared)) + follow, 0.0)

@@ -135,6 +135,9 @@ class Feeder(threading.Thread):
             self.spoilt["half"] += 1
         time.sleep(0.3)  # what is not read when a pseudo-terminal is closed is lost with it
         self.source.unplug()
+        until = time.monotonic() + 5
+        while self.connected() and time.monotonic() < until:  # nobody counts what is sent before it is noticed
+            time.sleep(0.01)
         time.sleep(0.2)
         self.source.plug()
 

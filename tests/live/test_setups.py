@@ -124,7 +124,7 @@ def test_the_command_in_a_terminal(tmp_path):
     process = subprocess.Popen(
         command, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
-    assert process.stdout.readline() == "pose 1 in bar/1\n"
+    assert process.stdout.readline().startswith("pose 1 in ")
     output, errors = process.communicate("f", timeout=120)
     assert process.returncode == 0, errors
     assert "written: c.h5" in output

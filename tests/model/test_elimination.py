@@ -12,7 +12,7 @@ import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_jax, to_numpy
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.kinematics.parameters import Parameters
-from aacmm_jax.model.elimination import Args, observed_model, observed_rows
+from aacmm_jax.model.elimination import Args, observed_model, observed_rows, pseudo_inverse
 from aacmm_jax.model.layout import layout_of
 from aacmm_jax.model.loss_names import LOSSES
 from aacmm_jax.model.observed import Observed
@@ -197,3 +197,9 @@ def test_groups_do_not_change_the_rows(paper_arm):
         z = np.concatenate([linear.z[: len(linear.space.names)], linear.z[len(linear.space.names) + part]])
         one = Linearisation.at(observed, Parameters(linear.space.base, linear.space.names), z, noise=NOISE, least=1e-3)
         np.testing.assert_allclose(white[number], one.white()[0], atol=1e-9)
+
+
+def test_what_is_not_finite_has_no_inverse_and_leaves_the_others():
+    inverses = pseudo_inverse(np.stack([np.diag([2.0, 0.0]), np.full((2, 2), np.nan)]))
+    np.testing.assert_allclose(inverses[0], np.diag([0.5, 0.0]))
+    assert np.all(np.isnan(inverses[1]))

@@ -146,3 +146,13 @@ def test_derivatives_of_effective_parameters():
     moved = [[effective_parameters(model, np.exp(at + sign * step * e)) for e in np.eye(6)] for sign in (1, -1)]
     np.testing.assert_allclose(forward, reverse, atol=1e-12)
     np.testing.assert_allclose(forward, (np.transpose(moved[0]) - np.transpose(moved[1])) / (2 * step), atol=1e-8)
+
+
+def test_what_is_left_of_the_information_takes_pinned_parameters_as_known():
+    """A bound that is reached is knowledge: the Schur complement is by the other parameters alone."""
+    rows = np.random.default_rng(0).normal(size=(30, 5)) * [1.0, 10.0, 0.1, 30.0, 1.0]
+    gram, pinned = rows.T @ rows, np.array([False, False, False, True, False])
+    model = eliminated(gram, np.zeros(5), np.zeros(1), np.array([0]), pinned)
+    free = [1, 2, 4]
+    expected = gram[0, 0] - gram[0, free] @ np.linalg.solve(gram[np.ix_(free, free)], gram[free, 0])
+    np.testing.assert_allclose(model.information, [[expected]])

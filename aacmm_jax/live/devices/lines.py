@@ -58,7 +58,7 @@ class AbstractLines(AbstractDevice):
                     return []
                 self._connect()
                 self.connected, self.message, self._skips = True, "", self.cuts_first
-                self._connected_at = self._line_at = now
+                self._connected_at = self._line_at = self._before = time.monotonic()
                 self._format.connected()
             came = self._bytes()
         except OSError as error:
