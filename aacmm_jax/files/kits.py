@@ -82,7 +82,8 @@ def read_kit(path: str | os.PathLike) -> list[KitItem]:
     """Read a kit: what is at hand for a calibration, with its uncertainties, for `planning.plan_kit`.
 
     Tables are ``[[artefact]]``, ``[[touched_sphere]]``, ``[[touched_cylinder]]``, ``[[planes]]`` (one, or two at a
-    ``distance``), ``[[points]]``, ``[[transforms]]``, ``[[distances]]`` and ``[[socket]]``; their keys are the
+    ``distance``), ``[[points]]``, ``[[transforms]]``, ``[[distances]]``, ``[[socket]]`` and, to simulate,
+    ``[[contact_sphere]]`` and ``[[contact_plane]]``; their keys are the
     arguments of the simulated observation, in mm and rad, and ``places`` (how many placements a plan is to choose; 0
     leaves the thing where it is stated), ``turned`` ("any", "vertical" for turns about the vertical alone, or "not"),
     and the cone from which the tool comes to it: ``half_angle_deg`` about ``normal``, which points out of its seats, in

@@ -96,7 +96,7 @@ def test_a_camera_of_a_kit(tmp_path):
 
 def test_every_kind_that_can_be_simulated_has_a_table():
     known = {"artefact", "touched_sphere", "touched_cylinder", "planes", "points", "transforms", "distances", "socket"}
-    assert set(simulated_kinds()) == known | {"pixels"}
+    assert set(simulated_kinds()) == known | {"pixels", "contact_sphere", "contact_plane"}
 
 
 @pytest.mark.parametrize(

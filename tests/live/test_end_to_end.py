@@ -103,7 +103,10 @@ class Running:
 
     def end(self) -> str:
         self.process.send_signal(signal.SIGINT)
-        said = self.process.communicate(timeout=60)[0]
+        try:
+            said = self.process.communicate(timeout=60)[0]
+        finally:
+            self.process.kill()
         assert self.process.returncode == 0, said
         return said
 
