@@ -48,6 +48,10 @@ def make(kind, draw, some):
             "x", q, draw.normal(size=(m, 3)), rotations(draw, m), u_angle=0.001, station=station, **covariance
         ),
         "plane": lambda: kinds.Plane("x", q, form=u, target=target),
+        "sphere contact": lambda: kinds.SphereContact(
+            "x", q, [f"contact {i}" for i in range(m)], diameter=25.4 if some else None, u=u, stylus=u / 3
+        ),
+        "plane contact": lambda: kinds.PlaneContact("x", q, [f"contact {i}" for i in range(m)], form=u),
         "parallel planes": lambda: kinds.ParallelPlanes(
             "x", q, readings(draw), 100 / 3, u=u, stylus=u / 3, inside=some, form=u, target=target
         ),
