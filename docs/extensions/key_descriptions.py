@@ -240,6 +240,8 @@ DESCRIPTIONS = {
     "probe": "Tip in the last frame, in the file's unit of lengths (manifests: mm).",
     "artefact": "Points whose coordinates are certified: ball bar, plate of balls or holes, tetrahedron.",
     "touched_sphere": "A sphere that was touched.",
+    "contact_sphere": "Contacts with a sphere that another chain of a robot carries.",
+    "contact_plane": "Contacts with a plane that another chain of a robot carries.",
     "touched_cylinder": "A pin or a ring that was touched.",
     "plane": "A plane that was touched.",
     "planes": "A plane that is touched, or two at a `distance`.",
