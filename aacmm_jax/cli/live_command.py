@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from ..uncertainty.coverage import U_AT_LEVEL
 from . import options
 from .app import command
 from .options import flag, option, output
@@ -31,7 +32,7 @@ def live(
         "Manifest of a plan (aacmm plan --manifest), with its table FILE.csv beside it.", "FILE.toml"
     ),
     kit: Path | None = option("Kit: the artefacts and instruments at hand, as for aacmm plan --kit.", "FILE.toml"),
-    target_mm: float | None = option("Expanded uncertainty (95 %) of a length at which to stop.", min=0),
+    target_mm: float | None = option(f"{U_AT_LEVEL} of a length at which to stop.", min=0),
     terminal: bool = flag("--terminal", "Show the capture in this terminal instead of a browser."),
     manual: bool = flag("--manual", "Take poses by a key or the arm's button only, and not at every rest."),
     capture_only: bool = flag("--capture-only", "Do not calibrate when the capture is finished."),
@@ -44,8 +45,9 @@ def live(
     base: str | None = options.BASE_LINK,
     tip: list[str] | None = options.TIP_LINK,
 ) -> None:
-    """Measure an arm with guidance: the command says where to put the tip next, and when it is enough.
+    """Measure an arm, guided from pose to pose.
 
+    The command says where to put the tip next, and when it is enough.
     A page in the browser (or --terminal) shows the arm as it moves, the next pose, the residual of each pose that was
     taken, and the uncertainty reached so far. Poses are taken when the arm is held still, by a key, or by the arm's
     button. Finishing writes the capture, its calibration and the report.

@@ -15,7 +15,6 @@ from ..core.text import listed, number
 from ..core.units import DEG
 from ..files.inputs import ROBOT_FILES
 from ..files.outputs import together, write_text
-from ..kinematics.arm import by_joint
 from . import options
 from .app import command, progress_bar, show_summary, with_spinner
 from .options import bad_option, flag, option, output, seed
@@ -339,6 +338,8 @@ def _rest(text: str | None, arm: Any, angles: str) -> list[float] | None:
         values = [number(part.strip()) for part in text.split(",")]
     except ValueError:
         bad_option("--rest", text, "one reading per joint, separated by commas")
+    from ..kinematics.arm import by_joint
+
     units = by_joint(arm, DEG if angles == "deg" else 1.0, 1.0)
     return values if len(values) != len(units) else [x * unit for x, unit in zip(values, units, strict=True)]
 

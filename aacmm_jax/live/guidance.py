@@ -60,7 +60,7 @@ class PoseResidual(NamedTuple):
 
 
 class Guidance(NamedTuple):
-    """The calibration of the poses so far. U is the expanded uncertainty (95 %) of a length, the largest over the
+    """The calibration of the poses so far. U is the expanded uncertainty of a length, the largest over the
     volume, mm."""
 
     arm: Arm  # as calibrated so far

@@ -20,7 +20,7 @@ _SHARE = 0.3  # part of the variance that is named
 
 
 class Progress(NamedTuple):
-    """U (95 %) of a length now and after ten more poses, mm (None while the poses do not determine it), what limits it,
+    """U of a length now and after ten more poses, mm (None while the poses do not determine it), what limits it,
     whether a target is met, and the poses that are planned."""
 
     u: float | None

@@ -42,7 +42,7 @@ class Session:
         setup: The arm and the places (`setup_of`).
         devices: Devices, or the texts that describe them. One at least reads the joints.
         path: Where `finish` writes the capture; its journal is beside it, and is continued if it exists.
-        target: Expanded uncertainty (95 %) of a length that is enough, mm; None for none.
+        target: Expanded uncertainty of a length that is enough, mm; None for none.
         automatic: Whether a pose is taken by itself at every rest in a place.
         stream: File to which everything that devices send is appended; by default it is not kept.
 

@@ -214,9 +214,9 @@ def _chosen(
             break
         pool = pool.joined(possible(*configurations_at(region, placement.points, starts * chains)))
     counts = np.bincount(problem.groups(pool.q, pool.owner), minlength=len(names) * max(1, len(problem.arm.chains)))
-    often = np.asarray(
-        counts >= _LEAST_CANDIDATES
-    )  # a chain of a robot that does not reach a socket takes no poses there
+    often: np.ndarray = np.greater_equal(
+        counts, _LEAST_CANDIDATES
+    )  # a chain takes no poses in sockets out of its reach
     few = np.flatnonzero(~often.reshape(len(names), -1).any(axis=1))
     if len(few):
         raise InputError(hardly_reached(f"socket '{names[few[0]]}'", placement.points[few[0]]))

@@ -77,6 +77,7 @@ def test_keys_and_clicks_do_what_they_say(shown, width, scheme):
         until(lambda: len(session.poses) == 2)
         page.keyboard.press(" ")  # the button that was clicked is not pressed again
         until(lambda: len(session.poses) == 3)
+        page.wait_for_function(ROWS, arg=3)
         # A pose that is chosen from the table or by the arrows is the one that is excluded.
         page.click("#poses tr:last-child")
         page.wait_for_selector("#exclude:has-text('Exclude 1')")
