@@ -214,13 +214,13 @@ def _chosen(
             break
         pool = pool.joined(possible(*configurations_at(region, placement.points, starts * chains)))
     counts = np.bincount(problem.groups(pool.q, pool.owner), minlength=len(names) * max(1, len(problem.arm.chains)))
-    often: np.ndarray = np.greater_equal(
-        counts, _LEAST_CANDIDATES
-    )  # a chain takes no poses in sockets out of its reach
-    few = np.flatnonzero(~often.reshape(len(names), -1).any(axis=1))
+    # A chain takes no poses in sockets out of its reach.
+    often = np.asarray(counts >= _LEAST_CANDIDATES)
+    by_chain = often.reshape(len(names), -1)
+    few = np.flatnonzero(~np.any(by_chain, axis=1))
     if len(few):
         raise InputError(hardly_reached(f"socket '{names[few[0]]}'", placement.points[few[0]]))
-    reaching = often.reshape(len(names), -1).any(axis=0)
+    reaching = np.atleast_1d(np.any(by_chain, axis=0))
     for number in region.chains:
         if not reaching[number]:
             raise InputError(
