@@ -47,9 +47,9 @@ _MOST_NAMED, _LEAST_SHARE = 4, 0.3  # of the parameters that do, and of the larg
 
 
 class Removed(NamedTuple):
-    """What a calibration left out, or divided, because it contradicts the rest, why, and what that changed."""
+    """What a calibration left out because it contradicts the rest, why, and what that changed."""
 
-    kind: str  # "socket", "placement", "station", ..., or "pose"; "seat" of a socket that was divided
+    kind: str  # "socket", "placement", "station", ..., or "pose"
     group: str  # its name; of poses with what was probably done wrong
     members: tuple[str, ...]  # names of its sockets and observations, or of poses
     ratio: float  # F: mean square that it added, over that of the rest

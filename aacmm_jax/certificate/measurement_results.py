@@ -10,7 +10,6 @@ from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..data.capture import ReferenceLength
 from ..data.observations.observation import Quantity, certified_quantities
-from ..diagnostics.contradictions import SEAT
 from ..diagnostics.pose_residuals import ObservationResiduals, distances_of, observation_residuals, rms
 from ..files.administrative_data import NOT_STATED, AdministrativeData, Reference
 from ..kinematics.arm import parameter_names, parameter_unit
@@ -132,8 +131,8 @@ def _methods(record: CalibrationRecord, residuals: tuple[ObservationResiduals, .
             f" The robust loss '{record.robust}' reduced the weight of poses with large residuals; "
             f"{len(less_weight(residuals))} poses have half of the full weight or less."
         )
-    if left_out := [f"{removed.kind} {removed.group}" for removed in record.removed if removed.kind != SEAT]:
-        groups = ", ".join(left_out)
+    if record.removed:
+        groups = ", ".join(f"{removed.kind} {removed.group}" for removed in record.removed)
         words += (
             f" The following data were left out, because an F test shows that they contradict the rest: {groups}; see "
             "the statements on data left out."

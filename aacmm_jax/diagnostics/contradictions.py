@@ -29,7 +29,6 @@ from .findings import Case, Finding, case_of, chance_text
 
 ORDER, NEEDS = 30, "scale"
 POSE, POSES = "pose", "poses"  # kinds of what was left out
-SEAT = "seat"  # that of a socket that was divided
 LEFT_OUT = "left-out"  # code of the finding on a group that the calibration left out
 # Mean square that a group adds over that of the others: errors outside the D-H model make it 7 on real arms, and it
 # is 1 where there are none.
@@ -80,25 +79,14 @@ def test(case: Case) -> list[Finding]:
 def removal(removed: Removed) -> Finding:
     """A group that the calibration left out."""
     first, second = removed.degrees_of_freedom
-    test = f"(F = {removed.ratio:.3g} with {first} and {second} degrees of freedom, {chance_text(removed.probability)})"
-    if removed.kind == SEAT:
-        return Finding(
-            "shifted-seat",
-            f"Socket {removed.members[0]} shifted, with its seat or with the artefact: {removed.group} {test}.",
-            f"The poses before and after it were used as two sockets: they are {removed.rms_without:.3g} mm RMS from "
-            f"their geometry instead of {removed.rms_with:.3g} mm.",
-            advice="Fasten the artefact, and check how the tip is seated.",
-            probability=removed.probability,
-            concerns=removed.members,
-            explains=1.0,
-        )
     these = "these poses" if removed.kind == POSES else f"this {removed.kind}"
     subject, contradict = f"{removed.kind} {removed.group}", "contradicts"
     if removed.kind in (POSE, POSES):
         subject, contradict = removed.group, "contradict" if removed.kind == POSES else "contradicts"
     return Finding(
         LEFT_OUT,
-        f"Left out: {subject}, which {contradict} the other data {test}.",
+        f"Left out: {subject}, which {contradict} the other data (F = {removed.ratio:.3g} with "
+        f"{first} and {second} degrees of freedom, {chance_text(removed.probability)}).",
         f"Without {these}, the other poses are {removed.rms_without:.3g} mm RMS from their geometry "
         f"instead of {removed.rms_with:.3g} mm. The parameter that changed most is {removed.changed_most}, by "
         f"{removed.change:.2g} standard uncertainties.",

@@ -84,6 +84,7 @@ class Session:
         self._next: guiding.NextPose | None = None
         self._busy: str | None = None
         self._message = ""
+        self._again: tuple[int | None, float] = None, np.inf  # pose that is to be taken again, and when that was said
         self._shown: tuple[int, dict[str, Any]] = -1, {}  # the version, and what is seen of it
         self._q: Float[np.ndarray, " n"] | None = None
         self._columns: dict[str, float] = {}
@@ -338,7 +339,8 @@ class Session:
         if self._looked_at <= rest.until < self._looked_at + _LOOK_EVERY:
             return
         self._looked_at = rest.until
-        if self._taken_q is not None:
+        # A pose that is to be taken again is where it was, seated anew since that was said.
+        if self._taken_q is not None and rest.since <= self._again[1]:
             moved = np.abs(rest.q - self._taken_q) / np.array(by_joint(self._arm, 1.0, 1000.0))
             if np.max(moved) < _APART:
                 return
@@ -367,6 +369,9 @@ class Session:
             with self._lock:
                 self._where = Whereabouts(self.setup, self._arm, self._captured.poses, found)
                 self._next, self._message = proposed, message
+                again = found.again.number if found is not None and found.again is not None else None
+                if again != self._again[0]:
+                    self._again = again, np.inf if again is None else self._sample_time
                 self._changed()
                 if proposed is not None:
                     for device in self._devices:

@@ -36,7 +36,6 @@ from .cross_validation import can_cross_validate, cross_validate
 from .data_corrections import camera_fits, corrected_capture, with_corrected_readings, with_prior_of_few
 from .hold_out import held_out_poses, tested, without_held_out
 from .reading_sets import with_other_readings
-from .seat_shifts import divided_alike, with_divided_sockets
 from .single import CalibrationOptions, calibrate, identify
 
 _SOLVE = CalibrationOptions()
@@ -108,9 +107,8 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         automatic: give too few data the prior and the noise of a real arm, leave out poses that were mixed up, correct
             readings that do not match the arm where one order, signs, zeros or unit explain them, find joints that move
             with others, widen default bounds that the fit reaches, free parameters whose fixed value the data
-            contradict, divide sockets whose seat shifted, leave out what contradicts the rest, and compare models of
-            the joints unless a model, a prior, a method or a robust loss is stated. ``decisions`` and ``removed`` of
-            the record say what was done and why.
+            contradict, leave out what contradicts the rest, and compare models of the joints unless a model, a prior,
+            a method or a robust loss is stated. ``decisions`` of the record says what was done and why.
         max_steps: most evaluations of each solve.
         stage: called with what is done next, in words, and a function that does it, such as to show progress.
 
@@ -142,7 +140,7 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
     elif chosen.model is not None and nominal.prior is None and nominal.arm.corrections is not None:
         nominal = nominal._replace(prior=default_prior(nominal.arm))
     recording = recording._replace(nominal=nominal._replace(arm=nominal.bounds().space.base))
-    automatic, decided, divisions = chosen.automatic and chosen.scale == "measured", (), ()
+    automatic, decided = chosen.automatic and chosen.scale == "measured", ()
     if automatic:
         recording, chosen, decided = with_prior_of_few(recording, chosen)
     anchor = None if chosen.hold == _SOLVE.hold else (chosen.hold,)  # two stages, which no other model would have
@@ -177,15 +175,11 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
                 record = chosen.stage("Checking bounds", lambda: with_wider_bounds(record, solved, recorded))
                 freed = lambda: with_wrong_fixed_freed(record, solved, recorded)  # noqa: E731
                 record = chosen.stage("Checking fixed parameters", freed)
-            if automatic and chosen.robust is None:
-                seats = lambda: with_divided_sockets(record, solved, recorded)  # noqa: E731
-                record, divisions = chosen.stage("Checking seats", seats)
             if chosen.remove_contradicting or (automatic and chosen.robust is None):  # which bad poses do not move
                 record = chosen.stage("Comparing groups", lambda: without_contradicting(record, solved, recorded))
             if automatic and not stated:
                 record = with_best_model(record, solved, recorded, chosen)
         if masks:
-            capture, masks = divided_alike(capture, masks, divisions)
             record = chosen.stage("Testing held-out poses", lambda: tested(record, capture, masks))
         if _to_cross_validate(record, chosen):
             record = chosen.stage("Cross-validating", lambda: _cross_validated(record, chosen))

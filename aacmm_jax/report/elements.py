@@ -220,7 +220,7 @@ def observation_tables(record: CalibrationRecord) -> list[Table]:
 
 
 def removed_tables(record: CalibrationRecord) -> list[Table]:
-    """What was left out or divided because it contradicts the rest, why, and what that changed."""
+    """What was left out because it contradicts the rest, why, and what that changed."""
     columns = {
         "group": lambda left_out: left_out.group,
         "kind": lambda left_out: left_out.kind,
@@ -232,7 +232,7 @@ def removed_tables(record: CalibrationRecord) -> list[Table]:
         "without the group [mm]": lambda left_out: left_out.rms_without,
         "parameter changed most": lambda left_out: f"{left_out.changed_most}, by {format_number(left_out.change, 1)} u",
     }
-    caption = "Data left out, and sockets divided, because they contradict the rest"
+    caption = "Data left out, because they contradict the rest"
     return [listed(caption, record.removed, columns)] if record.removed else []
 
 

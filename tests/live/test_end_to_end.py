@@ -113,7 +113,7 @@ class Running:
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(n, marks=pytest.mark.slow if n == "Panda in sockets" else pytest.mark.exhaustive) for n in ARMS],
+    [pytest.param(n, marks=pytest.mark.exhaustive) for n in ARMS],
 )
 def test_a_new_user_gets_a_calibrated_arm(name, shown, tmp_path):  # noqa: F811
     arm, kit, options, poses = ARMS[name]

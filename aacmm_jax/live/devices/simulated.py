@@ -45,6 +45,7 @@ _OPTIONS = {
 _FASTEST = 1.2  # rad/s, or m/s of prismatic joints
 _AHEAD = 0.5  # s that are computed at once
 _IDLE = 0.1  # s that an operator without a goal waits for one
+_LIFT = 0.05  # rad or mm: how far joints move to lift the probe out of its seat
 _TRIES = 12
 
 
@@ -125,6 +126,8 @@ class Simulated(AbstractDevice):
             self._hold(_IDLE)
             return
         wanted, self._seated = self._there(q)
+        if np.max(np.abs(wanted - self._q)) < _LIFT:  # a pose that is taken again is seated anew
+            self._move(np.clip(self._q + _LIFT, self.limits[:, 0], self.limits[:, 1]))
         self._move(wanted)
         self._kept = np.eye(self.joints)
         if self._seated:  # the seat holds the tip: what would move it is left out
