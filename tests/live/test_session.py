@@ -226,15 +226,14 @@ def killed_at_random(folder: Path, kills: int, seed: int) -> dict[str, int]:
     for kill in range(kills):
         command = [sys.executable, "-m", killed.__name__, str(path), str(kill)]
         root = Path(killed.__file__).parents[2]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=root)
-        assert process.stdout.readline() == "ready\n"
-        time.sleep(moment.uniform(0.05, 2.5))
-        process.kill()
-        for line in process.stdout.read().splitlines(keepends=True):
-            if line.endswith("\n"):
-                number, *rest = json.loads(line)
-                told[number] = rest
-        process.wait()
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=root) as process:
+            assert process.stdout.readline() == "ready\n"
+            time.sleep(moment.uniform(0.05, 2.5))
+            process.kill()
+            for line in process.stdout.read().splitlines(keepends=True):
+                if line.endswith("\n"):
+                    number, *rest = json.loads(line)
+                    told[number] = rest
         journal = Journal(journal_of(path))
         events = [event for event in journal.events if event["event"] == "pose"]
         dropped += journal.dropped
