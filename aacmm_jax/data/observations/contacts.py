@@ -6,6 +6,7 @@ unknown that both have in common, so that a contact is worth one equation. The s
 the chain that carries it, about its tip.
 """
 
+import abc
 from collections.abc import Mapping
 from typing import Any
 
@@ -123,9 +124,10 @@ class AbstractSimulatedContact(AbstractSimulated):
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         return random.uniform(*np.sort(self.region, axis=0), size=(self.poses, 3))
 
+    @abc.abstractmethod
     def surface_points(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
-        """Where the centre of the tip's ball touches, in the frame that carries the surface, about its tip."""
-        raise NotImplementedError
+        """Where the centre of the tip's ball touches ``(m, 3)``, mm, in the frame that carries the surface, about its
+        tip."""
 
     @property
     def sockets(self) -> tuple[str, ...]:
