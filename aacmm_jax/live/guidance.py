@@ -131,14 +131,17 @@ class Guide:
     ) -> NextPose | None:  # fmt: skip
         """The pose to take next from the present readings ``q``, in ``place`` where that is given; an outlier is taken
         again first. None where none is left that was not ``skipped``."""
-        proposals = Proposals(self.search, guidance, self._taken, q, skipped)
-        again = None if guidance is None else guidance.again
-        if again is not None and guidance is not None and place in (None, again.place):
+        ahead, known = self._ahead or self.search.planned, self.search.pool().candidates
+        arm, positions, again = self.search.problem.arm, dict[str, Any](), None
+        if guidance is not None:
+            ahead, known, again = guidance.ahead, guidance.known, guidance.again
+            arm, positions = guidance.arm, guidance.positions
+        proposals = Proposals(self.search, known, arm, positions, self._taken, q, skipped)
+        if guidance is not None and again is not None and place in (None, again.place):
             away = float(np.linalg.norm(guidance.poses[again.number].residual))
             once_more = proposals.again(again, f"Pose {again.number} is {away:.2g} mm off: take it again.")
             if once_more is not None:
                 return once_more
-        ahead = (self._ahead or self.search.planned) if guidance is None else guidance.ahead
         return proposals.best(ahead, place)
 
     def _solved(self, poses: Sequence[TakenPose], wrong: frozenset[int]) -> "_Solution":

@@ -3,21 +3,20 @@
 At first a few poses are taken in each place, since a calibration needs all of them; then more in a row.
 """
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..kinematics.arm import Arm
 from ..kinematics.workspace import reached
+from ..planning.designs import Candidates
 from ..planning.motion import approaches, move_contacts
 from ..planning.placement import LEAST_POSES
 from .candidates import Search
 from .limits import gained
 from .places import TakenPose
-
-if TYPE_CHECKING:
-    from .guidance import Guidance
 
 _HERE = 0.15  # rad, summed over joints: nearer than this a pose is the same
 _FIRST_VISIT, _VISIT = 4, 8  # poses in a row in one place while others still have too few, and afterwards
@@ -41,19 +40,20 @@ class Proposals:
 
     Args:
         search: The candidates.
-        guidance: The calibration so far, if there is one.
+        known: They, with what is known so far.
+        arm: The arm as it is calibrated so far, or the nominal one.
+        positions: Of the places that were found with it.
         taken: The poses that count, in order.
         now: Present readings, if they are known.
         skipped: Proposals that are not to be made again.
     """
 
     def __init__(
-        self, search: Search, guidance: "Guidance | None", taken: Sequence[TakenPose],
-        now: Float[np.ndarray, " n"] | None, skipped: Sequence[NextPose],
+        self, search: Search, known: Candidates, arm: Arm, positions: Mapping[str, Float[np.ndarray, " 3"]],
+        taken: Sequence[TakenPose], now: Float[np.ndarray, " n"] | None, skipped: Sequence[NextPose],
     ):  # fmt: skip
-        self.search, self.guidance, self.taken, self.now, self.skipped = search, guidance, taken, now, skipped
-        self.pool = search.pool()
-        self.known = self.pool.candidates if guidance is None else guidance.known
+        self.search, self.known, self.arm, self.positions = search, known, arm, positions
+        self.taken, self.now, self.skipped, self.pool = taken, now, skipped, search.pool()
 
     def again(self, pose: TakenPose, why: str) -> NextPose | None:
         """A pose that does not fit, once more; None where that was skipped."""
@@ -109,9 +109,9 @@ class Proposals:
         or would be no other pose, though a ``fresh`` one is wanted."""
         region, approach = self.search.problem.region, None
         thing, now = self.search.things[self.search.setup.place(place).thing.name], self.now
-        if fresh and self.guidance is not None and place in self.guidance.positions:
-            seat = thing.seat(region._replace(arm=self.guidance.arm))
-            there, good = reached(seat, q[None], self.guidance.positions[place][None])
+        if fresh and place in self.positions:
+            seat = thing.seat(region._replace(arm=self.arm))
+            there, good = reached(seat, q[None], self.positions[place][None])
             if not good[0] or self._is_old(place, there[0]):
                 return None
             q = there[0]
