@@ -123,7 +123,7 @@ export class View {
       this.colours = Object.fromEntries(names.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
     }
     this.#enclose();
-    this.scale = 1.15 * this.zoom * Math.min(this.width, this.height) / 2;
+    this.scale = 1.35 * this.zoom * Math.min(this.width, this.height) / 2;
     this.strokes = [];
     this.enlarged = this.#enlarged();
     this.#floor();
@@ -228,9 +228,11 @@ export class View {
   // How much residuals are enlarged, so that the 90 % longest is about a twelfth of the picture.
   #enlarged() {
     const drawn = this.scene.poses.filter((pose) => usable(pose.residual) && !pose.outlier);
-    const lengths = drawn.map((pose) => Math.hypot(...pose.residual)).sort((a, b) => a - b);
+    // Few poses have residuals of almost nothing, which say less than those that are expected.
+    const lengths = drawn.map((pose) => Math.max(Math.hypot(...pose.residual), pose.expected_mm || 0));
+    lengths.sort((a, b) => a - b);
     const large = lengths[Math.floor(0.9 * (lengths.length - 1))];
-    if (!large) return 1;
+    if (!(large > 1e-6 * this.extent)) return 1;
     const wanted = this.extent / 6 / large, power = 10 ** Math.floor(Math.log10(wanted));
     return Math.max(1, [5, 2, 1].find((digit) => digit * power <= wanted) * power);
   }
