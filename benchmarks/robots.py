@@ -1,8 +1,9 @@
 """Coverage of the 95 % intervals of a robot's parameters: two arms on a torso, on a rail, and on bases of their own.
 
-python benchmarks/robots.py [--trials 300] [--first 0] [--only torso]. Every tenth trial draws a true robot with errors of up to 1 mm and 2 mrad,
-and four sockets with 24 poses each, in turn of both arms; each draws encoder noise of 10 arcsec (10 um of the rail),
-which is stated. The longest link is held at its true length. Tied parameters are those of joints that both arms have.
+python benchmarks/robots.py [--trials 300] [--first 0] [--only torso]. Every tenth trial draws a true robot with errors
+of up to 1 mm and 2 mrad, and four sockets with 24 poses each, in turn of both arms; each draws encoder noise of 10
+arcsec (10 um of the rail), which is stated. The longest link is held at its true length. Tied parameters are those of
+joints that both arms have.
 """
 
 import argparse
