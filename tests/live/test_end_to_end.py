@@ -117,8 +117,12 @@ class Running:
         return said
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ARMS)
+SLOWEST = ("SCARA", "SO-101 with a camera")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.exhaustive if n in SLOWEST else pytest.mark.slow) for n in ARMS]
+)
 def test_a_new_user_gets_a_calibrated_arm(name, shown, tmp_path):  # noqa: F811
     arm, kit, options, poses = ARMS[name]
     arguments = arm(tmp_path) if callable(arm) else arm
@@ -148,6 +152,7 @@ def test_a_new_user_gets_a_calibrated_arm(name, shown, tmp_path):  # noqa: F811
         page.wait_for_selector("#paths li:nth-child(3)", timeout=400_000)
         picture(page, name, "after")
         page.set_viewport_size({"width": 400, "height": 900})
+        page.emulate_media(color_scheme="dark")
         picture(page, name, "narrow")
         assert page.evaluate("document.documentElement.scrollWidth") <= 400
         assert page.said == []
@@ -167,7 +172,7 @@ ROWS_AT_LEAST = "count => document.querySelectorAll('#poses tr').length >= count
 def picture(page, name: str, when: str) -> None:
     """A screenshot to look at, where a folder is named for them."""
     if folder := os.environ.get("AACMM_SCREENSHOTS"):
-        page.screenshot(path=Path(folder) / f"{name.replace(' ', '-')}-{when}.png")
+        page.screenshot(path=Path(folder) / f"{name.replace(' ', '-')}-{when}.png", full_page=when != "during")
 
 
 def true_arm(arguments: tuple[object, ...], folder: Path, device: str) -> "aj.Arm":

@@ -96,7 +96,8 @@ export class View {
     // Some robots' first axis points down; few robots hang from a ceiling.
     if (this.over === null && links.length) this.over = this.low[2] + this.high[2] < 0;
     this.middle = this.low.map((low, i) => (low + this.high[i]) / 2);
-    this.floor = this.over ? Math.max(this.high[2], 0) : Math.min(this.low[2], 0);
+    const heights = places.map((place) => place.position).filter(usable).map((point) => point[2]);
+    this.floor = this.over ? Math.max(0, ...heights) : Math.min(0, ...heights);
     this.extent = Math.max(Math.hypot(...this.low.map((low, i) => this.high[i] - low)) / 2, 1);
   }
 
@@ -124,7 +125,7 @@ export class View {
     }
     this.#enclose();
     this.scale = 1.35 * this.zoom * Math.min(this.width, this.height) / 2;
-    this.strokes = [];
+    [this.strokes, this.labels] = [[], []];
     this.enlarged = this.#enlarged();
     this.#floor();
     this.#marks();
@@ -136,6 +137,7 @@ export class View {
     }
     this.#chain(links, thick, false);
     this.strokes.sort((a, b) => b.depth - a.depth).forEach((stroke) => stroke.paint());
+    this.labels.forEach((paint) => paint());
     this.frames += 1;
     canvas.dataset.frames = this.frames;
   }
@@ -206,12 +208,15 @@ export class View {
       this.strokes.push({ depth: at[2], paint: () => {
         const done = place.wanted && place.poses >= place.wanted, next = place.name === this.scene.next;
         this.#dot(at, 7, done ? colours.good : colours.page, next ? colours.ghost : colours.ink, next ? 4 : 2);
+      } });
+      this.labels.push(() => { // in front of everything
+        const next = place.name === this.scene.next;
         Object.assign(pen, { font: "600 14px system-ui, 'DejaVu Sans', sans-serif", lineWidth: 4,
           strokeStyle: colours.page, fillStyle: next ? colours.ghost : colours.ink });
         const name = place.name.length > 24 ? `${place.name.slice(0, 23)}…` : place.name;
         pen.strokeText(name, at[0] + 12, at[1] - 9);
         pen.fillText(name, at[0] + 12, at[1] - 9);
-      } });
+      });
     }
     const colour = (pose) => (pose.outlier ? colours.bad : pose.excluded ? colours.soft : colours.warm);
     for (const pose of poses) {
