@@ -31,7 +31,7 @@ from .urdf import located
 
 _OBSERVATION = "observation_"
 _BESIDE = {  # the variables of what was recorded beside the joints' readings
-    CHAIN: ("chain", "1", "number of the robot's chain that the pose is of, from 0"),
+    CHAIN: ("chain", "1", "number of the robot's chain that the pose is of, from 0; 1.004: the link after joint 4"),
     "torques": ("torque", "N m", "torque of the joint's drive"),
     "directions": (
         "direction",

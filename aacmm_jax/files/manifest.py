@@ -35,7 +35,7 @@ from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
 from .reading_sets import other_readings, with_deviations
 from .toml import read_toml
-from .urdf_robots import joint_names
+from .urdf_robots import joint_names, link_numbers
 
 _QUIETLY = Detecting()
 
@@ -125,8 +125,10 @@ def _read(
         if angles is not None and angles.calibration is not None:
             angles = angles_by_motors(angles, source.open(angles.calibration), nominal.arm.joints)
         urdf = nominal.urdf
-        names = {} if urdf is None else {tip: joint_names(urdf._replace(tips=(tip,))) for tip in urdf.tips}
-        source.rows = readings = Readings(nominal.arm, angles, names)
+        chains = {} if urdf is None else {tip: urdf._replace(tips=(tip,)) for tip in urdf.tips}
+        names = {tip: joint_names(chain) for tip, chain in chains.items()}
+        links = {tip: link_numbers(chain) for tip, chain in chains.items()}
+        source.rows = readings = Readings(nominal.arm, angles, names, links)
         sockets, lengths, spheres = _read_recorded(model, source)
         observed: list[tuple[str, Any]] = [(seat.session, seat) for seat in sockets.values() if not seat.target]
         # Where another tip than the arm's own probe was held, it is an observation.

@@ -61,8 +61,8 @@ class Arm(eqx.Module):
             in rad, or mm. Their column of the readings is not used.
         chains: Joints of each chain of a robot by name, from the base to the tip, numbers from 1. The column after
             those of the joints is then the number of the chain that a pose is of, from 0; joints of other chains do not
-            matter for it. ``probe`` has the tips of all chains in turn, ``(..., 3 c)``: ``probe_x`` of the first chain,
-            ``probe2_x`` of the second.
+            matter for it. 1.004 is the frame after joint 4 instead of the tip of chain 1. ``probe`` has the tips of all
+            chains in turn, ``(..., 3 c)``: ``probe_x`` of the first chain, ``probe2_x`` of the second.
         directions: Whether n more columns follow: 1 where the joint reached the pose with rising readings, -1 with
             falling ones, 0 where it is unknown; for backlash.
         load: Whether one more column follows: the mass at the tip, kg, besides that of the arm and its tool; 0 where it
