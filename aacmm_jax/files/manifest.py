@@ -24,7 +24,7 @@ from ..kinematics.parameters import ArmSpecification
 from ..kinematics.robots import together
 from ..kinematics.workspace import Reach
 from ..model.robot_bases import with_found_bases
-from .arms import arm_beside, for_capture, read_arm, usual_noise
+from .arms import arm_beside, for_capture, read_arm, usual_noise, with_load_centre
 from .controllers.lerobot import angles_by_motors
 from .inputs import InputFile
 from .manifest_pixels import Cameras, Detecting, Progress, observations_of, without_progress
@@ -163,6 +163,8 @@ def _read(
         capture = _capture(lengths, observed, probe == "remounted")
         nominal = nominal._replace(arm=with_found_bases(reading_as(nominal.arm, readings.beside), capture))
         check_readings(capture, nominal.arm)
+        if model.load_centre is not None and "load" not in readings.beside:
+            raise InputError("load_centre is given, but no table has load_kg; add it, or remove load_centre.")
         as_found = None if model.as_found is None else _as_found(arm_beside(path.parent, model.as_found), nominal.arm)
         recording = Recording(
             capture,
@@ -187,13 +189,19 @@ def _nominal(folder: Path, model: Any) -> tuple[ArmSpecification, bool]:
     if isinstance(model.arm, str):
         if model.bases:
             raise InputError("bases are given, but the manifest names one arm; remove bases.")
-        return read_arm(arm_beside(folder, model.arm), **options)
+        nominal, proposed = read_arm(arm_beside(folder, model.arm), **options)
+        return _loaded(model, nominal), proposed
     arms = {name: read_arm(arm_beside(folder, file), **options)[0].arm for name, file in model.arm.items()}
     for name in model.bases:
         if name not in arms:
             raise InputError(f"bases names the unknown arm '{name}'{nearest(name, arms)}")
     bases = {name: base_transform(np.array(numbers)) for name, numbers in model.bases.items()}
-    return ArmSpecification(together(arms, bases=bases), " and ".join(arms)), False
+    return _loaded(model, ArmSpecification(together(arms, bases=bases), " and ".join(arms))), False
+
+
+def _loaded(model: Any, nominal: ArmSpecification) -> ArmSpecification:
+    centre = model.load_centre
+    return nominal if centre is None else with_load_centre(nominal, centre, model.probe)
 
 
 def _usual_noise(folder: Path, arm: str, model: Any) -> ArmNoise | None:

@@ -258,6 +258,7 @@ class _Poses(Recorded):
     base: str | None = None  # links of a URDF
     tip: str | list[str] | None = None
     probe: Point | None = None  # mm, from the tip link
+    load_centre: list[FiniteFloat] | None = None  # likewise: centre of mass of the load
     acceptance: Standard | Annotated[list[Standard], AfterValidator(each_once)] = Field(default_factory=list)
     measuring_range: PositiveFloat | None = None  # diameter of the measuring volume as the maker states it, mm
     angles: Angles | None = None

@@ -107,7 +107,7 @@ class JointKinds:
         known = np.where(inside, numbers, 0.0)
         chain, link = known.astype(int), np.minimum(_link_of(known), len(self.prismatic))
         inside &= np.abs(numbers - body_of(chain, link)) < 1e-6
-        return inside & ((link == 0) | (self._of_chain[chain, link - 1] > 0))
+        return np.asarray(inside & ((link == 0) | (self._of_chain[chain, link - 1] > 0)))
 
 
 def of_joints(geometry: Any, rows: Float[AnyArray, "columns ..."], offset: float = 1.0) -> Float[AnyArray, "n ..."]:

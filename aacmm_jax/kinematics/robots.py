@@ -196,6 +196,7 @@ def _with_corrections(
         corrections=Corrections(KnownFunctions(tuple(kept.values())), nominal),
         coefficients=np.asarray(robot.coefficients)[places],
         gravity=base[:3, :3].T @ np.asarray(robot.gravity),
+        load_centre=robot.load_centre and robot.load_centre[3 * number : 3 * number + 3],
         **dict.fromkeys(robot.recorded, True),
     )
 
@@ -321,9 +322,11 @@ def together(
     values = dict(zip(_ROW, np.array(rows).T, strict=True))
     if not np.any(values["beta"]) and all(arm.beta is None for arm in arms.values()) and not any(map(_is_mount, place)):
         del values["beta"]
+    loads = [arm.probe if arm.load_centre is None else arm.load_centre for arm in arms.values()]
     return Arm(
         **values,
         probe=np.concatenate([np.asarray(arm.probe) for arm in arms.values()]),
+        load_centre=None if all(arm.load_centre is None for arm in arms.values()) else np.concatenate(loads),
         limits=limits,
         prismatic=prismatic,
         fixed=fixed,
