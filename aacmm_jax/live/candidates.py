@@ -16,10 +16,12 @@ from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.capture_data import ReferenceLength
 from ..data.observations.observation import AbstractObservation
+from ..kinematics.chain import reading_units
 from ..model.observed import Observed
 from ..planning.designs import Candidates, covariance_of, exchange
 from ..planning.kit import neighbours
 from ..planning.kit_placement import Thing, candidates_of_kit, set_up
+from ..planning.motion import joint_weights
 from ..planning.placement import LEAST_POSES
 from ..planning.problem import DesignProblem, PlanOptions
 from .places import Setup, by_thing, label_of
@@ -28,6 +30,7 @@ TEN = 10  # poses that a prediction is for
 _STARTS = 2000  # random configurations in all things
 _FIRST, _MOST, _ADDED = 30, 60, 3  # poses of a plan where nothing is stated; the most ahead; added to them at once
 _SEARCHED = 400  # candidates that an exchange tries, drawn anew after every pose
+_SCALE_U = 1e-6  # of the scale of the nominal arm, where it is taken as exact
 
 Observations = Sequence[AbstractObservation]
 
@@ -66,6 +69,8 @@ class Search:
             above = 0.0 if min(heights, default=0.0) >= 0 else -math.inf
             options = PlanOptions.usual(setup.noise)._replace(space=setup.specification.space(), above=above)
         self.problem = DesignProblem.of(setup.specification.arm, options)
+        arm = self.problem.arm
+        self.weights = joint_weights(arm) / np.broadcast_to(reading_units(arm.geometry), (arm.joints,))
         self.things, self.unreached = dict[str, Thing](), dict[str, str]()
         drawn, groups = [], by_thing(setup)
         for name, places in groups.items():
@@ -79,6 +84,8 @@ class Search:
             drawn.append(poses)
         if not self.things:
             raise InputError(next(iter(self.unreached.values())))
+        measured = setup.lengths or arm.prismatic or any(part.fixes_scale for part in drawn)
+        self.scaled = bool(measured)  # whether anything determines the scale; else that of the nominal arm is taken
         self._names = {place.name: i for i, place in enumerate(setup.places)}
         self._pools: dict[tuple[str, str], Pool] = {}
         every = np.full(len(setup.places), LEAST_POSES)
@@ -91,6 +98,10 @@ class Search:
         self._sets = [*first, self._near(first[0])]
         if len(first) == 1:
             self.planned = self.chosen(self.pool().candidates, len(self.planned), self.planned, every, sweeps=2)
+
+    def away(self, q: Float[np.ndarray, "... n"], other: Float[np.ndarray, "... n"]) -> Float[np.ndarray, "..."]:
+        """How far joints move from one configuration to another, summed, rad."""
+        return np.asarray(np.abs((q - other) * self.weights).sum(axis=-1))
 
     def chosen(
         self,
@@ -171,7 +182,13 @@ class Search:
             columns = {name: len(self.problem.space.names) + at for name, at in positions.items()}
         most = max(part.rows.shape[1] for part in parts)
         rows = [np.pad(part.rows, ((0, 0), (0, most - part.rows.shape[1]), (0, 0))) for part in parts]
-        candidates = parts[0]._replace(rows=np.concatenate(rows), owner=np.array(places))
+        base = parts[0].base.copy()
+        if not self.scaled:
+            space = self.problem.space
+            along = np.where(space.lengths, np.asarray(space.vector()), 0.0)  # natural steps of lengths are mm
+            along /= _SCALE_U * (along @ along)
+            base[: len(along), : len(along)] += np.outer(along, along)
+        candidates = parts[0]._replace(rows=np.concatenate(rows), owner=np.array(places), base=base)
         return Pool(np.concatenate(q), np.array(places), candidates, columns)
 
     def _stated(self, drawn: Observations) -> tuple[list[AbstractObservation], list[int]]:

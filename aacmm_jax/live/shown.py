@@ -125,4 +125,8 @@ def headline(busy: str | None, unread: Sequence[str], state: dict[str, Any]) -> 
         return f"Pose {last['number']} does not fit: take it again in {last['place']}"
     if state["stop"]:
         return "The target is met: finish, or take more poses"
-    return f"Go to {state['next']['place']} and hold still" if state["next"] else "Take a pose"
+    if not state["next"]:
+        return "Take a pose"
+    place = next(place for place in state["places"] if place["name"] == state["next"]["place"])
+    goal = f"Go to {place['name']}" if place["position"] else f"Go to the next pose ({place['name']})"
+    return f"{goal} and hold still"

@@ -152,8 +152,8 @@ def test_a_new_user_gets_a_calibrated_arm(name, shown, tmp_path):  # noqa: F811
     assert "capture.h5" in said
     assert (tmp_path / "capture-calibration.html").stat().st_size > 100_000
     record = aj.files.load_calibration(tmp_path / "capture-calibration.h5")
-    assert error_of(record.result.arm, true := true_arm(arguments, tmp_path, device)) < 0.5 * error_of(
-        record.nominal.arm, true
+    assert error_of(record.calibrated, true := true_arm(arguments, tmp_path, device)) < 0.5 * error_of(
+        record.recording.nominal.arm, true
     )
 
 

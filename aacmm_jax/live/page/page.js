@@ -59,6 +59,7 @@ function choose(question, choices, answer) {
 const actions = {
   take: () => ask("take"),
   undo: () => ask("undo"),
+  skip: () => ask("skip"),
   exclude() {
     const pose = state?.poses.find((one) => one.number === chosen) ?? state?.poses.at(-1);
     if (pose) ask("exclude", { pose: pose.number, excluded: !pose.excluded });
@@ -75,7 +76,7 @@ const actions = {
     ["Write and calibrate", () => ask("finish", { calibrate: true })],
     ["Write only", () => ask("finish", { calibrate: false })]]),
 };
-const keys = { " ": "take", u: "undo", x: "exclude", s: "mark", a: "auto", m: "sound", f: "finish" };
+const keys = { " ": "take", u: "undo", x: "exclude", n: "skip", s: "mark", a: "auto", m: "sound", f: "finish" };
 
 for (const [id, act] of Object.entries(actions)) {
   $(id).addEventListener("click", (event) => {
@@ -227,6 +228,7 @@ function everything() {
   }
   places();
   poses();
+  $("skip").disabled = !next;
   for (const id of ["sentences", "paths"]) {
     $(id).replaceChildren(...(state[id] ?? []).map((text) => element("li", text)));
   }
