@@ -144,6 +144,7 @@ def test_another_pose_is_proposed_when_asked_for(session, tmp_path, monkeypatch)
         session.skip()
     device = Scripted()  # a device is read by one session
     monkeypatch.setattr(guidance, "Guide", Proposing)
+    device = Scripted()
     with aj.live.Session(SETUP, [device], path=tmp_path / "d.h5") as session:
         for number in range(3):
             until(lambda number=number: (session.state()["next"] or {}).get("why") == f"{number} skipped")
