@@ -42,6 +42,7 @@ _NEWER = 0.8  # of the largest ratio, from which the newest pose is the outlier
 _OPEN = 1e-3  # eigenvalue of I - H below which nothing else shows an error of the pose
 _LEAST_U = 1e-4  # mm: smallest standard uncertainty of what is certified
 _ROUNDS = 3  # of leaving out poses
+_STEPS = 30  # of a calibration, which begins at the one before; few poses hardly determine where it ends
 
 
 class PoseResidual(NamedTuple):
@@ -147,24 +148,25 @@ class Guide:
     def _solved(self, poses: Sequence[TakenPose], wrong: frozenset[int]) -> "_Solution":
         """The calibration without wrong poses, and the rows of all poses at it."""
         problem = self.search.problem
-        capture, _ = capture_of(self.setup, [pose for pose in poses if pose.number not in wrong] or poses)
+        whole, numbers = capture_of(self.setup, poses)
+        kept = [pose for pose in poses if pose.number not in wrong]
+        capture = capture_of(self.setup, kept)[0] if wrong and kept else whole
         endless = np.full(len(problem.space.names), np.inf)
         bounds, options = Bounds(problem.space, -endless, endless), {"start": self._start, "noise": problem.noise}
-        options |= {"prior": self._prior, "replace_noise": False}
+        options |= {"prior": self._prior, "replace_noise": False, "max_steps": _STEPS}
         if capture.lengths or fixes_scale(capture):
             result = calibrate(problem.arm, capture, bounds, **options, shared_errors=False, undetermined="ignore")
         else:  # the prior holds the scale
             result = identify(problem.arm, capture, bounds, **options, hold=None)
         vector = np.asarray(result.parameters)
         self._start = vector if np.all(np.isfinite(vector)) else None
-        whole, numbers = capture_of(self.setup, poses)
         arm = to_numpy(result.arm)
         observed = to_numpy(Observed.of(whole, arm))
         geometry = {name: np.asarray(values) for name, values in result.observed.geometry.items()}
         if any(name not in geometry for name in observed.blocks):
             alone = to_numpy(Observed.of(without_lengths(whole), arm))
-            kept = {name: values for name, values in geometry.items() if name in alone.blocks}
-            geometry = alone.split(np.asarray(fit_geometry(arm, alone, kept, problem.noise).geometry))
+            near = {name: values for name, values in geometry.items() if name in alone.blocks}
+            geometry = alone.split(np.asarray(fit_geometry(arm, alone, near, problem.noise).geometry))
         z = np.concatenate([vector, *(geometry[name] for name in observed.blocks)])
         linear = Linearisation.at(
             observed, Parameters(arm, problem.space.names), z, noise=problem.noise, least=_LEAST_U

@@ -1,6 +1,6 @@
-"""The pose to take next, of those that are planned: near the present one, with few changes of place.
+"""The pose to take next, of those that are planned: near the present one, with few changes from thing to thing.
 
-At first a few poses are taken in each place, since a calibration needs all of them; then more in a row.
+At first a few poses are taken in each socket or artefact, since a calibration needs all of them; then more in a row.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,8 +19,9 @@ from .limits import gained
 from .places import TakenPose
 
 _HERE = 0.15  # rad, summed over joints: nearer than this a pose is the same
-_FIRST_VISIT, _VISIT = 4, 8  # poses in a row in one place while others still have too few, and afterwards
+_FIRST_VISIT, _VISIT = 4, 8  # poses in a row in one thing while others still have too few, and afterwards
 _AWAY = 1e3  # rad that count for a change of place against the order
+_UNPLANNED, _TRIED = 10.0, 30  # rad that count for a candidate that is not planned; how many of these are tried
 _MOVES = 6  # that are checked for collisions
 
 
@@ -54,6 +55,11 @@ class Proposals:
     ):  # fmt: skip
         self.search, self.known, self.arm, self.positions = search, known, arm, positions
         self.taken, self.now, self.skipped, self.pool = taken, now, skipped, search.pool()
+        places, names = search.setup.places, list(search.things)
+        self._things = np.array([names.index(p.thing.name) if p.thing.name in names else -1 for p in places])
+        by_name = {place.name: thing for place, thing in zip(places, self._things, strict=True)}
+        self._visited = [int(by_name[pose.place]) for pose in taken if by_name[pose.place] >= 0]
+        self._counts = np.bincount(self._visited, minlength=len(names))
 
     def again(self, pose: TakenPose, why: str) -> NextPose | None:
         """A pose that does not fit, once more; None where that was skipped."""
@@ -64,13 +70,13 @@ class Proposals:
         """Of the planned candidates the nearest that the joints can move to without a collision, or of all candidates,
         where none is left; in ``place``, where that is given."""
         owner, names = self.known.owner, [place.name for place in self.search.setup.places]
-        for rows in (np.array(ahead, dtype=int), np.arange(len(self.pool.q))):
+        for rows in (np.array([*ahead, *self._in_needy_things()], dtype=int), np.arange(len(self.pool.q))):
             inside = rows if place is None else rows[owner[rows] == names.index(place)]
             inside = np.array([i for i in inside if not self._is_old(names[owner[i]], self.pool.q[i])], dtype=int)
-            if len(rows) > len(ahead) and len(inside):  # of all of them those that are worth most
+            if len(rows) == len(self.pool.q) and len(inside):  # of all of them those that are worth most
                 part = self.known._replace(rows=self.known.rows[inside], owner=owner[inside])
                 inside = inside[self.search.chosen(part, min(_MOVES, len(inside)))]
-            for row in self._in_order(inside, names):
+            for row in self._in_order(inside, ahead):
                 why = gained(self.search.problem, self.known, row)
                 if (proposed := self._proposed(names[owner[row]], self.pool.q[row], why)) is not None:
                     return proposed
@@ -82,27 +88,32 @@ class Proposals:
         old += [self.taken[-1].q[: len(q)]] if last and self.taken else []
         return any(self.search.away(q, other) < _HERE for other in old)
 
-    def _in_order(self, rows: Int[np.ndarray, " r"], names: Sequence[str]) -> list[int]:
+    def _in_order(self, rows: Int[np.ndarray, " r"], ahead: Sequence[int]) -> list[int]:
         """The first few of some candidates, those without a collision on the way first."""
-        now, owner = self.now, self.known.owner[rows]
+        now = self.now
         if now is None or not len(rows):
             return rows[:_MOVES].tolist()
-        away = self.search.away(self.pool.q[rows], now) + self._change_of_place(owner, names)
-        first = rows[np.argsort(away)[:_MOVES]]
+        away = self.search.away(self.pool.q[rows], now) + _UNPLANNED * ~np.isin(rows, ahead)
+        first = rows[np.argsort(away + self._change_of_place(self._things[self.known.owner[rows]]))[:_MOVES]]
         contacts = move_contacts(self.search.problem.region, np.tile(now, (len(first), 1)), self.pool.q[first])
         return [int(i) for i, _ in sorted(zip(first, contacts, strict=True), key=lambda pair: pair[1] is not None)]
 
-    def _change_of_place(self, owner: Int[np.ndarray, " r"], names: Sequence[str]) -> Float[np.ndarray, " r"]:
-        """What the place of a candidate counts beside the motion to it, rad."""
-        visited = [names.index(pose.place) for pose in self.taken]
-        if not visited:
-            return np.zeros(len(owner))
-        counts, here = np.bincount(visited, minlength=len(names)), visited[-1]
-        run = next((i for i, place in enumerate(reversed(visited)) if place != here), len(visited))
-        few = counts.min() < LEAST_POSES
-        if run < (min(_FIRST_VISIT, self.search.setup.places[here].wanted) if few else _VISIT):
-            return _AWAY * (owner != here)
-        return _AWAY * ((owner == here) + (counts[owner] if few else 0.0))
+    def _in_needy_things(self) -> list[int]:
+        """Some candidates in things that have too few poses, since few may be planned there, which prove impossible."""
+        things = self._things[self.known.owner]
+        return [
+            int(i) for k in np.flatnonzero(self._counts < LEAST_POSES) for i in np.flatnonzero(things == k)[:_TRIED]
+        ]
+
+    def _change_of_place(self, things: Int[np.ndarray, " r"]) -> Float[np.ndarray, " r"]:
+        """What a candidate in another thing than the last pose counts beside the motion to it, rad."""
+        if not self._visited:
+            return np.zeros(len(things))
+        here, few = self._visited[-1], bool(self._counts.min() < LEAST_POSES)
+        run = next((i for i, thing in enumerate(reversed(self._visited)) if thing != here), len(self._visited))
+        if run < (_FIRST_VISIT if few else _VISIT):
+            return _AWAY * (things != here)
+        return _AWAY * ((things == here) + (self._counts[things] if few else 0.0))
 
     def _proposed(self, place: str, q: np.ndarray, why: str, fresh: bool = True) -> NextPose | None:
         """A pose with its tip where the place is, by the arm as it is calibrated so far; None where it cannot be there,

@@ -310,7 +310,7 @@ class Session:
     def _read_device(self, device: AbstractDevice) -> None:
         while not self._stop.is_set():
             samples = device.read()
-            raw = b"" if self._stream is None else device.raw()
+            raw = device.raw()
             if not samples and not raw:
                 continue
             with self._lock:
@@ -356,6 +356,7 @@ class Session:
         if self._taken_q is not None and rest.since <= self._again[1]:
             moved = np.abs(rest.q - self._taken_q) / np.array(by_joint(self._arm, 1.0, 1000.0))
             if np.max(moved) < _APART:
+                self._taken_until = rest.until  # also while it ends, with readings of the next motion in it
                 return
         place = self._place_at(self._tip_of(rest.q))
         if place is not None:

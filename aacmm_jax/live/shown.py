@@ -128,5 +128,6 @@ def headline(busy: str | None, unread: Sequence[str], state: dict[str, Any]) -> 
     if not state["next"]:
         return "Take a pose"
     place = next(place for place in state["places"] if place["name"] == state["next"]["place"])
-    goal = f"Go to {place['name']}" if place["position"] else f"Go to the next pose ({place['name']})"
-    return f"{goal} and hold still"
+    alone = len(state["places"]) == 1
+    goal = place["name"] if place["position"] else f"the next pose{'' if alone else ' for ' + place['name']}"
+    return f"Go to {goal} and hold still"

@@ -139,10 +139,12 @@ class Proposing(NoGuide):
         return guidance.NextPose("A", np.zeros(ARM.joints), f"{len(skipped)} skipped", 0.0)
 
 
-def test_another_pose_is_proposed_when_asked_for(session, device, tmp_path, monkeypatch):
+def test_another_pose_is_proposed_when_asked_for(session, tmp_path, monkeypatch):
     with pytest.raises(aj.InputError, match="no pose is proposed"):
         session.skip()
+    device = Scripted()  # a device is read by one session
     monkeypatch.setattr(guidance, "Guide", Proposing)
+    device = Scripted()
     with aj.live.Session(SETUP, [device], path=tmp_path / "d.h5") as session:
         for number in range(3):
             until(lambda number=number: (session.state()["next"] or {}).get("why") == f"{number} skipped")

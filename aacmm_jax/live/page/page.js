@@ -142,9 +142,10 @@ function live(now) {
   if (!now) return;
   put($("stillness"), now.still ? `Still ${known(now.since) ? now.since.toFixed(1) : ""} s` : "Moving");
   $("now").classList.toggle("still", Boolean(now.still));
-  [...$("joints").querySelectorAll("dd")].forEach((node, i) => {
+  [...$("joints").children].forEach((pair, i) => {
     const unit = { deg: "°" }[state?.arm.joints[i]?.unit] ?? ` ${state?.arm.joints[i]?.unit ?? ""}`;
-    put(node, known(now.q?.[i]) ? `${now.q[i].toFixed(3)}${unit}` : "–");
+    put(pair.children[1], known(now.q?.[i]) ? `${now.q[i].toFixed(3)}${unit}` : "–");
+    put(pair.children[2], known(state?.next?.q?.[i]) ? `next ${state.next.q[i].toFixed(1)}${unit}` : "");
   });
   view.show({ links: now.links ?? [], tip: now.tip ?? null });
   put($("rate"), known(now.rate) ? `${digits(now.rate, 2)} readings a second` : "");
@@ -222,7 +223,7 @@ function everything() {
   if ($("joints").children.length !== arm.joints.length) {
     $("joints").replaceChildren(...arm.joints.map((one) => {
       const pair = element("div");
-      pair.append(element("dt", one.name), element("dd", "–"));
+      pair.append(element("dt", one.name), element("dd", "–"), element("dd", "", "goal"));
       return pair;
     }));
   }
