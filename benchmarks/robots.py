@@ -1,8 +1,9 @@
 """Coverage of the 95 % intervals of a robot's parameters: two arms on a torso, on a rail, and on bases of their own.
 
-python benchmarks/robots.py [--trials 300]. Every tenth trial draws a true robot with errors of up to 1 mm and 2 mrad,
-and four sockets with 24 poses each, in turn of both arms; each draws encoder noise of 10 arcsec (10 um of the rail),
-which is stated. The longest link is held at its true length. Tied parameters are those of joints that both arms have.
+python benchmarks/robots.py [--trials 300] [--first 0] [--only torso]. Every tenth trial draws a true robot with errors
+of up to 1 mm and 2 mrad, and four sockets with 24 poses each, in turn of both arms; each draws encoder noise of 10
+arcsec (10 um of the rail), which is stated. The longest link is held at its true length. Tied parameters are those of
+joints that both arms have.
 """
 
 import argparse
@@ -49,7 +50,7 @@ def kinds_of(robot: aj.Arm, names: tuple[str, ...]) -> list[str]:
     return ["base" if name in bases else "tied" if name in tied else "untied" for name in names]
 
 
-def covered(name: str, robot: aj.Arm, trials: int) -> dict[str, list[np.ndarray]]:
+def covered(name: str, robot: aj.Arm, trials: range) -> dict[str, list[np.ndarray]]:
     """By kind of parameter, of every trial which of the true values the intervals contain."""
     sockets = BETWEEN if name == "two bases" else SOCKETS
     whole = aj.Parameters.independent(robot)
@@ -59,7 +60,7 @@ def covered(name: str, robot: aj.Arm, trials: int) -> dict[str, list[np.ndarray]
     bounds, exact, true = aj.Bounds.around(robot, space), None, robot
     kinds, inside = np.array(kinds_of(robot, space.names)), {}
     deviation = NOISE.of_columns(robot.geometry.kinds, robot.joints, robot.columns)
-    for trial in range(trials):
+    for trial in trials:
         random = np.random.default_rng(trial)
         if exact is None or trial % 10 == 0:
             true = aj.perturbed_arm(space, length=1.0, angle=0.002, seed=trial)
@@ -77,8 +78,12 @@ def main() -> None:
     """Print the coverage of each kind of parameter of each robot."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--trials", type=int, default=300)
-    for name, robot in robots().items():
-        for kind, rows in covered(name, robot, parser.parse_args().trials).items():
+    parser.add_argument("--first", type=int, default=0, help="seed of the first trial, a multiple of ten")
+    parser.add_argument("--only", help="of this robot alone")
+    options = parser.parse_args()
+    trials = range(options.first, options.first + options.trials)
+    for name in [options.only] if options.only else robots():
+        for kind, rows in covered(name, robots()[name], trials).items():
             shares = np.mean(rows, axis=1)
             error = shares.std(ddof=1) / np.sqrt(len(shares))
             text = f"coverage {100 * shares.mean():.1f} +- {100 * error:.1f} %"

@@ -333,6 +333,7 @@ def _form(problems: Problems, space: Parameters, options: BatchOptions, with_len
         loss=None if options.robust is None else Loss(options.robust),
         # Only covariances need to know which readings are one, and each answer is a program.
         pose=configurations(observed.q) if options.covariance else tuple(range(observed.q.shape[0])),
+        read_once=observed.read_once,
         max_steps=options.max_steps,
         covariance=options.covariance,
         axes=axes,

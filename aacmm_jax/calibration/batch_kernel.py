@@ -22,6 +22,7 @@ from ..kinematics.parameters import Bounds, Parameters
 from ..kinematics.priors import Prior
 from ..model.elimination import observed_model, own_covariances, with_linear_geometry
 from ..model.observed import Observed
+from ..model.read_once import ReadOnce
 from ..model.robust import Loss
 from ..model.rows import PointRows, Whitening
 from ..model.scale import scale_and_weights
@@ -56,6 +57,7 @@ class Form(NamedTuple):
     noise_model: NoiseModel
     loss: Loss | None
     pose: tuple[int, ...]
+    read_once: ReadOnce
     max_steps: int
     covariance: bool
     axes: Problems  # trees of the axes, 0 or None
@@ -94,7 +96,8 @@ class _Chunk(NamedTuple):
         axes, arm = form.axes, problems.arm
 
         def observed_of(arm: Arm, capture: Capture) -> Observed:
-            return Observed.of(capture if form.with_lengths else without_lengths(capture), arm)
+            capture = capture if form.with_lengths else without_lengths(capture)
+            return Observed.of(capture, arm, read_once=form.read_once)
 
         if axes.capture is None and arm.corrections is None:
             # The arm's values do not matter.

@@ -178,16 +178,20 @@ class SocketTruth(NamedTuple):
     exact: Float[np.ndarray, "M n"]
     moves: Float[np.ndarray, "M n 3"]  # the least change of the joints for each mm that the tip shall move
     lengths: Float[np.ndarray, " l"]  # between the tips, mm
+    counted: Float[np.ndarray, "_ n"]  # 0 where an error of a joint's reading is none of a pose
     shared: DrawShared | None = None  # shared errors
 
     @classmethod
     def of(cls, arm: Arm, capture: Capture) -> "SocketTruth":
         """By a calibrated arm."""
-        exact, units = project_to_centroids(arm, capture), reading_units(arm.geometry)
-        by_joints = np.asarray(arm.jacobian(exact, [f"q_{i}" for i in range(1, arm.joints + 1)]))
+        counted = to_numpy(Observed.of(capture, arm)).counted
+        counted = np.ones((1, arm.joints)) if counted is None else counted.T
+        kept = None if counted.all() else counted == 0
+        exact, units = project_to_centroids(arm, capture, kept=kept), reading_units(arm.geometry)
+        by_joints = np.asarray(arm.jacobian(exact, [f"q_{i}" for i in range(1, arm.joints + 1)])) * counted[:, None]
         moves = units[:, None] * np.linalg.pinv(by_joints * units, rcond=1e-8)
         ends = np.asarray(arm.position(exact))[starts(capture.sizes)[capture.ends()]]
-        return cls(arm, capture, exact, moves, np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1))
+        return cls(arm, capture, exact, moves, np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1), counted)
 
     @property
     def size(self) -> int:
@@ -203,7 +207,9 @@ class SocketTruth(NamedTuple):
         alike = None if self.shared is None else self.shared(count, random)
         seats = seats if alike is None else seats + alike.tips
         read = noise.of_columns(arm.geometry.kinds, arm.joints, exact.shape[1])
-        readings = exact + read * level * random.normal(size=(count, *exact.shape))
+        errors = read * level * random.normal(size=(count, *exact.shape))
+        errors[..., : arm.joints] *= self.counted
+        readings = exact + errors
         readings[..., : arm.joints] += np.einsum("Nic,tNc->tNi", self.moves, seats)
         readings += 0.0 if alike is None else alike.joints
         return self._batch(readings, self.lengths, random), alike
@@ -256,10 +262,13 @@ class ObservedTruth(NamedTuple):
         encoder = noise.of_columns(self.kinds, self.parts[0].by_readings.shape[1], q.shape[1])
         read = encoder * level * random.normal(size=(count, self.reading.max() + 1, q.shape[1]))
         values = self.values(count, random)
-        errors = self.errors_of_rows(count, level * float(noise.seating), random)
+        errors, counted = self.errors_of_rows(count, level * float(noise.seating), random), self.observed.counted
         observations = []
         for part, error in zip(self.parts, errors, strict=True):
-            shift, readings = error - np.asarray(part.values), q[part.poses] + read[:, self.reading[part.poses]]
+            shift, added = error - np.asarray(part.values), read[:, self.reading[part.poses]]
+            if counted is not None:
+                added[..., : len(counted)] *= counted[:, part.poses].T
+            readings = q[part.poses] + added
             if alike is not None:
                 shift = shift + np.einsum("rcm,tmc->trm", np.asarray(part.by_tip), alike.tips[:, part.poses])
                 readings = readings + alike.joints[:, part.poses]

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from ..core.arguments import Range, check_finite, checked, checked_arguments, items_of, real_number, shown
 from ..core.arrays import Numbers, as_floats
-from ..core.errors import InputError, nearest
+from ..core.errors import InputError, naming, nearest
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.random_keys import random_generator, random_key, random_numbers
 from ..core.units import ARCSEC
@@ -18,6 +18,7 @@ from ..kinematics.chain import length_scale
 from ..kinematics.corrected_arm import holding_torques
 from ..kinematics.correction_kinds import REFERENCE_TEMPERATURE
 from ..kinematics.inverse_kinematics import project_to_targets, random_configurations
+from ..kinematics.robots import chains_of
 from .capture import Capture
 from .capture_data import ReferenceLength, check_temperatures
 from .noise import Noise
@@ -26,6 +27,8 @@ from .observations.declared import MOST_POSES
 from .observations.observation import AbstractObservation
 from .observations.simulated import AbstractSimulated
 
+_ROUNDS, _DRAWN = 50, 2000  # of random configurations, for a link in a region
+_TRIED = 3  # positions of a surface for each contact, of which the other chain reaches some
 _RESOLUTION = Annotated[Float[AnyArray, ""] | Float[AnyArray, " 2"], Range(least=0)]
 
 
@@ -118,8 +121,7 @@ def simulate(
     exact = np.repeat(places, list(counts.values()), axis=0)
     references = _reference_lengths(points, lengths, length_key)
     labels = np.repeat([f"socket '{name}'" for name in counts], list(counts.values())).tolist()
-    contacts = {thing.name: thing.carrying for thing in simulated if isinstance(thing, AbstractSimulatedContact)}
-    taken = _chain_numbers(arm, contacts | dict(chains or {}), {**counts}, [thing.name for thing in simulated])
+    taken = _chain_numbers(arm, chains, {**counts}, [thing.name for thing in simulated])
     of_poses = np.concatenate([np.resize(taken[name], count) for name, count in counts.items()] or [np.zeros(0, int)])
     angles = recorder.read(recorder.configurations(arm, exact, reach_key, seat_key, labels, of_poses), encoder_key)
     ends = np.cumsum(list(counts.values()))
@@ -128,10 +130,12 @@ def simulate(
     pairs = zip(simulated, keys, strict=True)
     others = []
     for thing, key in pairs:
-        observation, transforms = recorder.recorded(thing, key, taken.get(getattr(thing, "name", "")))
-        others.append(observation)
         if isinstance(thing, AbstractSimulatedContact):
-            readings |= recorder.touching(thing, transforms, key)
+            observation, of_sockets = recorder.contacts(thing, key)
+            readings |= of_sockets
+        else:
+            observation = recorder.recorded(thing, key, taken.get(getattr(thing, "name", "")))
+        others.append(observation)
     return Capture(readings, references, others)
 
 
@@ -152,26 +156,34 @@ class _Recorder(NamedTuple):
         reach_key: Array,
         seat_key: Array,
         labels: Sequence[str],
-        chain: Int[np.ndarray, " m"],
+        chain: Float[np.ndarray, " m"] | Int[np.ndarray, " m"],
+        held: Float[np.ndarray, "m n"] | None = None,
+        enough: int | None = None,
     ) -> Float[np.ndarray, "m columns"]:
-        """Random configurations of an arm at points, where the seat lets it be, with what is recorded beside them."""
+        """Random configurations of an arm at points, where the seat lets it be, with what is recorded beside them;
+        ``held`` and ``enough`` are those of `random_configurations`."""
         targets = points + self.noise.seating * random_numbers("normal", seat_key, points.shape)
-        beside = holding.beside
-        q = np.zeros((len(labels), beside.width(beside.possible)))
+        beside, q = holding.beside, self.rows(chain)
+        scaled = targets / length_scale(holding.geometry, q)[:, None]
+        of_poses = q[:, holding.joints : beside.own]
+        found = random_configurations(holding, scaled, reach_key, self.limits, labels, of_poses, held, enough)
+        q[:, : holding.joints] = found
+        if "torques" in beside.possible:
+            q[:, beside.slices(q.shape[1])["torques"]] = holding_torques(holding, q)
+        if {"directions", "load"} & set(beside.possible):
+            q, _ = project_to_targets(holding, q, targets, kept=None if held is None else ~np.isnan(held))
+        return q
+
+    def rows(self, chain: Float[np.ndarray, " m"] | Int[np.ndarray, " m"]) -> Float[np.ndarray, "m columns"]:
+        """Readings of 0 of poses of these chains, with what is drawn beside them."""
+        beside = self.arm.beside
+        q = np.zeros((len(chain), beside.width(beside.possible)))
         columns = {name: q[:, part] for name, part in beside.slices(q.shape[1]).items()}
         for name, (low, high) in self.drawn.items():
             columns[name][:] = self.random.uniform(low, high, columns[name].shape)
         if beside.chains:
-            q[:, holding.joints] = chain
+            q[:, self.arm.joints] = chain
         columns["directions"][:] = self.random.choice([-1.0, 1.0], columns["directions"].shape)
-        scaled = targets / length_scale(holding.geometry, q)[:, None]
-        of_poses = q[:, holding.joints : beside.own]
-        found = random_configurations(holding, scaled, reach_key, self.limits, labels=labels, beside=of_poses)
-        q[:, : holding.joints] = found
-        if columns["torques"].size:
-            columns["torques"][:] = holding_torques(holding, q)
-        if {"directions", "load"} & set(beside.possible):
-            q, _ = project_to_targets(holding, q, targets)
         return q
 
     def read(self, q: Float[np.ndarray, "m columns"], key: Array) -> Float[np.ndarray, "m columns"]:
@@ -183,8 +195,8 @@ class _Recorder(NamedTuple):
 
     def recorded(
         self, simulated: AbstractSimulated, key: Array, chain: Int[np.ndarray, " c"] | None
-    ) -> tuple[AbstractObservation, Float[np.ndarray, "m 4 4"]]:
-        """One simulated observation, and the true transforms of its tips."""
+    ) -> AbstractObservation:
+        """One simulated observation."""
         if not isinstance(simulated, AbstractSimulated):
             raise InputError(
                 f"{simulated!r} cannot be simulated; give a simulated observation from aj.data.observations, such "
@@ -200,18 +212,53 @@ class _Recorder(NamedTuple):
         # An instrument sees the tip where it is: the seat's error moves the tip, and not what it is compared with.
         transforms = np.asarray(holding.pose(angles)).copy()
         transforms[:, :3, 3] = exact
-        return simulated.recorded(self.read(angles, encoder_key), transforms, random), transforms
+        return simulated.recorded(self.read(angles, encoder_key), transforms, random)
 
-    def touching(
-        self, contact: AbstractSimulatedContact, transforms: Float[np.ndarray, "m 4 4"], key: Array
-    ) -> dict[str, Float[np.ndarray, "1 columns"]]:
-        """The poses of the chain that touches a surface, each a socket of its own."""
-        reach_key, seat_key, encoder_key, own_key = jax.random.split(jax.random.fold_in(key, 1), 4)
-        points = contact.touched(transforms, np.random.default_rng(np.asarray(jax.random.key_data(own_key))))
-        chain = np.repeat(_numbers(self.arm, (contact.touching,)), contact.poses)
-        labels = [f"contact '{name}'" for name in contact.sockets]
-        q = self.read(self.configurations(self.arm, points, reach_key, seat_key, labels, chain), encoder_key)
-        return dict(zip(contact.sockets, q[:, None], strict=True))
+    def contacts(
+        self, contact: AbstractSimulatedContact, key: Array
+    ) -> tuple[AbstractObservation, dict[str, Float[np.ndarray, "1 columns"]]]:
+        """Contacts, and the poses of the chain that touches, each a socket of its own. Joints that move both bodies
+        are in both poses where they are, and as they were read."""
+        carry_key, lean_key, reach_key, seat_key, read_key, touch_key, own_key = jax.random.split(key, 7)
+        random = np.random.default_rng(np.asarray(jax.random.key_data(own_key)))
+        touching, carrying = _numbers(self.arm, (contact.touching, contact.carrying))
+        many, n, kinds = contact.changed(poses=_TRIED * contact.poses), self.arm.joints, self.arm.geometry.kinds
+        labels = [f"observation '{contact.name}'"] * many.poses
+        with naming(labels[0]):
+            body = chains_of(self.arm)[contact.carrying].body(contact.link)
+        at_tip = many.tips(random)
+        if body == carrying:
+            angles = self.configurations(self.arm, at_tip, carry_key, lean_key, labels, np.full(many.poses, body))
+        else:
+            angles = self._within(np.sort(contact.region, axis=0), body, labels)
+        transforms = np.asarray(self.arm.pose(angles)).copy()
+        seats = self.noise.seating * random_numbers("normal", lean_key, at_tip.shape)
+        transforms[:, :3, 3] = at_tip if body == carrying else transforms[:, :3, 3] + seats
+        assert kinds is not None
+        both = kinds.members(np.array([touching, body]))[:, :n].all(axis=0)
+        held = np.where(both, angles[:, :n], np.nan)
+        numbers, points = np.full(many.poses, touching), many.touched(transforms, random)
+        labels = [f"contact '{name}'" for name in many.sockets]
+        q = self.configurations(self.arm, points, reach_key, seat_key, labels, numbers, held, contact.poses)
+        chosen = np.flatnonzero(np.isfinite(q).all(axis=1))[: contact.poses]
+        read, touched = self.read(angles[chosen], read_key), self.read(q[chosen], touch_key)
+        touched[:, :n] = np.where(both, read[:, :n], touched[:, :n])
+        observation = contact.recorded(read, transforms[chosen], random)
+        return observation, dict(zip(contact.sockets, touched[:, None], strict=True))
+
+    def _within(
+        self, box: Float[np.ndarray, "2 3"], body: float, labels: Sequence[str]
+    ) -> Float[np.ndarray, "m columns"]:
+        """Random configurations with the origin of a link in a box."""
+        found, arm = [], self.arm
+        for _ in range(_ROUNDS):
+            q = self.rows(np.full(_DRAWN, body))
+            q[:, : arm.joints] = self.random.uniform(self.limits[:, 0], self.limits[:, 1], (_DRAWN, arm.joints))
+            origins = np.asarray(arm.position(q))
+            found += list(q[np.all((box[0] <= origins) & (origins <= box[1]), axis=1)])
+            if len(found) >= len(labels):
+                return np.array(found[: len(labels)])
+        raise InputError(f"{labels[0]} has a link that is hardly ever in its region; give a region where the link is.")
 
 
 def _chain_numbers(

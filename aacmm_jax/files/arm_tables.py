@@ -190,6 +190,7 @@ class ArmFile(Strict):
     torques: bool = False
     directions: bool = False
     load: bool = False
+    load_centre: list[FiniteFloat] | None = None  # of mass, in the frame of the probe; by default the tip
     thermometer: bool = False
     identification: Identification | None = None
     corrections: CorrectionsTable | None = None

@@ -210,8 +210,10 @@ def _specification(path: Path, model: ArmFile, probe: Numbers | None) -> ArmSpec
     else:
         arm = _arm_of_rows(model)
         specification = ArmSpecification(arm if probe is None else with_tool(arm, probe))
-    arm = specification.arm
-    arm = reading_as(arm, [name for name in COLUMNS if getattr(model, name)])
+    if model.load_centre is not None:
+        centre, tool = units["mm"] * np.array(model.load_centre), units["mm"] * np.array(model.probe)
+        specification = with_load_centre(specification, centre, tool if probe is None else probe)
+    arm = reading_as(specification.arm, [name for name in COLUMNS if getattr(model, name)])
     if model.corrections is not None:
         arm = model.corrections.corrected(arm, units)
     prior = None if model.priors is None else model.priors.prior(arm, units)
@@ -230,6 +232,17 @@ def _specification(path: Path, model: ArmFile, probe: Numbers | None) -> ArmSpec
     )
     specification.bounds()  # refuses names that the arm does not have
     return specification
+
+
+def with_load_centre(specification: ArmSpecification, centre: Numbers, tool: Numbers | None) -> ArmSpecification:
+    """The arm with the centre of mass of its load, mm, in the frame in which the tool is stated: of a URDF in its tip
+    links, else in the last frames. `InputError` where these are not three numbers, or three of each chain."""
+    arm = specification.arm
+    centres = np.asarray(arm.replace(load_centre=centre).load_centre)
+    if specification.urdf is not None:
+        probe = np.asarray(arm.probe)
+        centres = centres + probe - (0.0 if tool is None else np.resize(tool, probe.shape))
+    return specification._replace(arm=arm.replace(load_centre=centres))
 
 
 def _stated(proposed: Identification) -> tuple[str, ...]:
@@ -324,6 +337,8 @@ def specification_toml(specification: ArmSpecification, *, source: str = "", pro
     document.update({"convention": "standard", "length_unit": "mm", "angle_unit": "rad"})
     geometry = {kind: np.asarray(getattr(arm, kind)).tolist() for kind in GEOMETRY if getattr(arm, kind) is not None}
     document["probe"] = geometry.pop("probe")[:3]
+    if arm.load_centre is not None:
+        document["load_centre"] = list(arm.load_centre)
     facts = {"prismatic": list(arm.prismatic)} | dict.fromkeys(arm.recorded, True) | chain_facts(arm)
     document.update({key: fact for key, fact in facts.items() if fact})
     rows = tomlkit.array().multiline(True)

@@ -31,14 +31,14 @@ from .urdf import located
 
 _OBSERVATION = "observation_"
 _BESIDE = {  # the variables of what was recorded beside the joints' readings
-    CHAIN: ("chain", "1", "number of the robot's chain that the pose is of, from 0"),
+    CHAIN: ("chain", "1", "number of the robot's chain that the pose is of, from 0; 1.004: the link after joint 4"),
     "torques": ("torque", "N m", "torque of the joint's drive"),
     "directions": (
         "direction",
         "1",
         "1 after a rising reading of the joint, -1 after a falling one, 0 unknown",
     ),
-    "load": ("load", "kg", "mass at the tip"),
+    "load": ("load", "kg", "mass of the load"),
     "thermometer": ("temperature", "degC", "temperature of the arm"),
 }
 
@@ -274,6 +274,7 @@ def arm_table(specification: ArmSpecification) -> Table:
         values["chains"] = [f"{','.join(map(str, joints))} {name}" for name, joints in arm.chains]
     values |= {name: np.ravel(facts[name]).tolist() for name in {"mimic", "further_probes"} & facts.keys()}
     values |= {"prismatic": arm.prismatic or None} | {name: name in arm.recorded or None for name in COLUMNS}
+    values["load_centre"] = arm.load_centre
     if arm.limits is not None:
         values["lowest"], values["highest"] = np.transpose(arm.limits)
     if arm.corrections is not None:
@@ -315,6 +316,7 @@ def specification_of(path: str | os.PathLike, stored: Stored, name: str) -> ArmS
             fixed=list(attributes.get("fixed", ())),
             mimic=[(int(i), int(j), x, y) for i, j, x, y in np.reshape(attributes.get("mimic", ()), (-1, 4)).tolist()],
             chains=[(name, [int(i) for i in joints.split(",")]) for joints, _, name in chains],
+            load_centre=attributes.get("load_centre"),
         )
         arm = reading_as(arm, [name for name in COLUMNS if attributes.get(name, False)])
         if "coefficients" in table:

@@ -24,7 +24,7 @@ from ..kinematics.parameters import ArmSpecification
 from ..kinematics.robots import together
 from ..kinematics.workspace import Reach
 from ..model.robot_bases import with_found_bases
-from .arms import arm_beside, for_capture, read_arm, usual_noise
+from .arms import arm_beside, for_capture, read_arm, usual_noise, with_load_centre
 from .controllers.lerobot import angles_by_motors
 from .inputs import InputFile
 from .manifest_pixels import Cameras, Detecting, Progress, observations_of, without_progress
@@ -35,7 +35,7 @@ from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
 from .reading_sets import other_readings, with_deviations
 from .toml import read_toml
-from .urdf_robots import joint_names
+from .urdf_robots import joint_names, link_numbers
 
 _QUIETLY = Detecting()
 
@@ -125,8 +125,10 @@ def _read(
         if angles is not None and angles.calibration is not None:
             angles = angles_by_motors(angles, source.open(angles.calibration), nominal.arm.joints)
         urdf = nominal.urdf
-        names = {} if urdf is None else {tip: joint_names(urdf._replace(tips=(tip,))) for tip in urdf.tips}
-        source.rows = readings = Readings(nominal.arm, angles, names)
+        chains = {} if urdf is None else {tip: urdf._replace(tips=(tip,)) for tip in urdf.tips}
+        names = {tip: joint_names(chain) for tip, chain in chains.items()}
+        links = {tip: link_numbers(chain) for tip, chain in chains.items()}
+        source.rows = readings = Readings(nominal.arm, angles, names, links)
         sockets, lengths, spheres = _read_recorded(model, source)
         observed: list[tuple[str, Any]] = [(seat.session, seat) for seat in sockets.values() if not seat.target]
         # Where another tip than the arm's own probe was held, it is an observation.
@@ -161,6 +163,8 @@ def _read(
         capture = _capture(lengths, observed, probe == "remounted")
         nominal = nominal._replace(arm=with_found_bases(reading_as(nominal.arm, readings.beside), capture))
         check_readings(capture, nominal.arm)
+        if model.load_centre is not None and "load" not in readings.beside:
+            raise InputError("load_centre is given, but no table has load_kg; add it, or remove load_centre.")
         as_found = None if model.as_found is None else _as_found(arm_beside(path.parent, model.as_found), nominal.arm)
         recording = Recording(
             capture,
@@ -185,13 +189,19 @@ def _nominal(folder: Path, model: Any) -> tuple[ArmSpecification, bool]:
     if isinstance(model.arm, str):
         if model.bases:
             raise InputError("bases are given, but the manifest names one arm; remove bases.")
-        return read_arm(arm_beside(folder, model.arm), **options)
+        nominal, proposed = read_arm(arm_beside(folder, model.arm), **options)
+        return _loaded(model, nominal), proposed
     arms = {name: read_arm(arm_beside(folder, file), **options)[0].arm for name, file in model.arm.items()}
     for name in model.bases:
         if name not in arms:
             raise InputError(f"bases names the unknown arm '{name}'{nearest(name, arms)}")
     bases = {name: base_transform(np.array(numbers)) for name, numbers in model.bases.items()}
-    return ArmSpecification(together(arms, bases=bases), " and ".join(arms)), False
+    return _loaded(model, ArmSpecification(together(arms, bases=bases), " and ".join(arms))), False
+
+
+def _loaded(model: Any, nominal: ArmSpecification) -> ArmSpecification:
+    centre = model.load_centre
+    return nominal if centre is None else with_load_centre(nominal, centre, model.probe)
 
 
 def _usual_noise(folder: Path, arm: str, model: Any) -> ArmNoise | None:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..core.errors import InputError
+from ..core.errors import InputError, nearest
 from ..core.text import listed, quoted
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import check_revolutions
@@ -33,6 +33,7 @@ class Wanted(NamedTuple):
     taken: Sequence[int] = ()  # columns, from 0, that hold something else
     beside: Mapping[str, float | None] = {}  # one value for all rows, of what each row may have in a column
     chain: str | None = None  # of a robot: the one that the poses are of
+    link: int | str | None = None  # of this chain; by default its tip
 
 
 def checked_unit(
@@ -58,8 +59,15 @@ class Readings:
     directions, loads or temperatures and another not.
     """
 
-    def __init__(self, arm: Arm, angles: Angles | None, names: Mapping[str, Sequence[str]] = MappingProxyType({})):
+    def __init__(
+        self,
+        arm: Arm,
+        angles: Angles | None,
+        names: Mapping[str, Sequence[str]] = MappingProxyType({}),
+        links: Mapping[str, Mapping[str, int]] = MappingProxyType({}),
+    ):
         self._arm, self._angles, self._names = arm, angles, names  # of the joints in a robot's file, by tip
+        self._links = links  # likewise, with the number of the joint before each
         self._first: str | os.PathLike | None = None  # the file of the first table
         self.beside: tuple[str, ...] = ()  # what the tables have beside the readings
         self.columns: list[int] = []  # of the joints in the first table, from 1
@@ -109,7 +117,7 @@ class Readings:
                 add = f"add a column {BESIDE[name]} to {without}, or state {BESIDE[name]} in its table."
             raise InputError(f"{without} has no {what}, but {other} has {what}; {add}")
         if chain is not None:
-            q = chain.readings(q)
+            q = chain.readings(q, self._link(wanted))
             recorded |= {name: chain.spread(recorded[name]) for name in BY_JOINT if name in recorded}
         return np.hstack([q, *recorded.values()])
 
@@ -121,6 +129,17 @@ class Readings:
         if stated is None:
             raise InputError(f"the arm has the chains {listed(names)}; state the chain of the table (chain = ...).")
         return chain_of(self._arm, stated)
+
+    def _link(self, wanted: Wanted) -> int | None:
+        """The number of the link that the manifest names."""
+        if not isinstance(wanted.link, str):
+            return wanted.link
+        numbers = {link: number for link, number in self._links.get(wanted.chain or "", {}).items() if number}
+        if wanted.link not in numbers:
+            raise InputError(
+                f"chain '{wanted.chain}' has no moving link '{wanted.link}'{nearest(wanted.link, numbers)}"
+            )
+        return numbers[wanted.link]
 
     @property
     def _in_order(self) -> bool:

@@ -199,6 +199,7 @@ class _Reader:
             [i for columns in others for i in text.pick(columns)] if readings is text else [],
             {"load": table.load_kg, "thermometer": table.temperature_C},
             table.chain,
+            getattr(table, "link", None),
         )
         rows_of = {source.quantity: (rows := source.rows(readings, wanted))}
         rows_of |= {key: self._column(text, self.entries[key], columns) for key, columns in chosen.items()}

@@ -23,6 +23,7 @@ from ..core.rotation_conventions import NUMBERS_OF_ROTATION, is_convention
 from ..core.rotations import roll_pitch_yaw_matrix
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import ReferenceLength
+from ..data.observations.contacts import AbstractContact
 from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation
 from ..data.observations.pixels import Pixels
@@ -160,6 +161,8 @@ def _model(kind: type[AbstractObservation]) -> type[NamedTable]:
             stated = dict[str, Point]
         if stated is not None:
             fields[entry.name] = (bool, False) if entry.content == "truth" else (stated | None, None)
+    if issubclass(kind, AbstractContact):
+        fields["link"] = (int | str | None, None)  # by default the last one of the chain
     return create_model(f"{kind.__name__}Table", __base__=_Table, **fields)
 
 
@@ -255,6 +258,7 @@ class _Poses(Recorded):
     base: str | None = None  # links of a URDF
     tip: str | list[str] | None = None
     probe: Point | None = None  # mm, from the tip link
+    load_centre: list[FiniteFloat] | None = None  # likewise: centre of mass of the load
     acceptance: Standard | Annotated[list[Standard], AfterValidator(each_once)] = Field(default_factory=list)
     measuring_range: PositiveFloat | None = None  # diameter of the measuring volume as the maker states it, mm
     angles: Angles | None = None

@@ -98,6 +98,7 @@ ARM: Fields = {
     "torques": truth("whether torques of the joints follow their readings"),
     "directions": truth("whether directions of approach of the joints follow"),
     "load": truth("whether a load follows"),
+    "load_centre": number("centre of mass of the load in the last frame, mm, of each chain", ""),
     "thermometer": truth("whether the last column of the readings is the temperature"),
     "prior_groups": text("groups of parameters with a prior"),
     "prior_sd": number("standard deviation of each group with a prior, mm or rad", ""),

@@ -112,5 +112,14 @@ def _longest_chains(robot: Robot, paths: list[list[UrdfJoint]]) -> dict[tuple[st
 
 def joint_names(source: UrdfSource) -> list[str]:
     """The names of the moving joints of the chain, from the base."""
-    path = joints_between(parse_robot(source.text), source.base, source.tip)
-    return [joint.name for joint in path if joint.kind != "fixed"]
+    return [joint.name for joint in _path(source) if joint.kind != "fixed"]
+
+
+def link_numbers(source: UrdfSource) -> dict[str, int]:
+    """The links of the chain, and the number of the moving joint before each."""
+    path = _path(source)
+    return {joint.child: sum(other.kind != "fixed" for other in path[:i]) for i, joint in enumerate(path, start=1)}
+
+
+def _path(source: UrdfSource) -> list[UrdfJoint]:
+    return joints_between(parse_robot(source.text), source.base, source.tip)

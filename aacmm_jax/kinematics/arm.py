@@ -28,6 +28,7 @@ from .joint_checks import with_chains as with_chains
 DOWN = (0.0, 0.0, -1.0)
 JointLimits = Float[np.ndarray, "n 2"]
 NEARLY_PARALLEL = 0.02  # |sin alpha|, about 1 degree, below which Denavit-Hartenberg parameters are nearly singular
+_LOAD_CENTRES = Float[np.ndarray, " numbers"]
 _BY_JOINT, _BY_TERM, _VECTOR = (Float[Array, shape] for shape in ("... joints", "... coefficients", "... 3"))
 _LARGEST = 20_000  # configurations: up to here NumPy is sooner done than a compiler
 
@@ -61,12 +62,13 @@ class Arm(eqx.Module):
             in rad, or mm. Their column of the readings is not used.
         chains: Joints of each chain of a robot by name, from the base to the tip, numbers from 1. The column after
             those of the joints is then the number of the chain that a pose is of, from 0; joints of other chains do not
-            matter for it. ``probe`` has the tips of all chains in turn, ``(..., 3 c)``: ``probe_x`` of the first chain,
-            ``probe2_x`` of the second.
+            matter for it. 1.004 is the frame after joint 4 instead of the tip of chain 1. ``probe`` has the tips of all
+            chains in turn, ``(..., 3 c)``: ``probe_x`` of the first chain, ``probe2_x`` of the second.
         directions: Whether n more columns follow: 1 where the joint reached the pose with rising readings, -1 with
             falling ones, 0 where it is unknown; for backlash.
-        load: Whether one more column follows: the mass at the tip, kg, besides that of the arm and its tool; 0 where it
+        load: Whether one more column follows: the mass of a load, kg, besides that of the arm and its tool; 0 where it
             is missing.
+        load_centre: Centre of mass of the load in the last frame ``(3,)``, mm, as the probe is; by default the tip.
         thermometer: Whether readings have one more, last column: the temperature of the arm, C, of which only thermal
             expansion makes use. Where it is missing, the arm is taken to be at 20 C.
 
@@ -93,6 +95,7 @@ class Arm(eqx.Module):
     fixed: tuple[int, ...] = eqx.field(static=True)
     mimic: tuple[tuple[int, int, float, float], ...] = eqx.field(static=True)
     chains: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)
+    load_centre: tuple[float, ...] | None = eqx.field(static=True)  # of each chain
 
     def __init__(
         self,
@@ -115,6 +118,7 @@ class Arm(eqx.Module):
         fixed: Iterable[int] = (),
         mimic: Iterable[tuple[int, int, float, float]] = (),
         chains: Mapping[str, Sequence[int]] | Iterable[tuple[str, Sequence[int]]] = (),
+        load_centre: Numbers | None = None,
     ):
         sizes: dict[str, int] = {}
         self.alpha = checked(alpha, Annotated[_BY_JOINT, NOT_EMPTY], "alpha", sizes)
@@ -124,6 +128,11 @@ class Arm(eqx.Module):
         self.chains = checked_chains(chains, self.joints)
         tips = probe if not self.chains or np.shape(probe) != (3,) else np.tile(probe, len(self.chains))
         self.probe = checked(tips, _tips_annotation(tips_of(self)), "probe")
+        self.load_centre = None
+        if load_centre is not None:
+            centres = np.tile(load_centre, tips_of(self)) if np.shape(load_centre) == (3,) else load_centre
+            sizes["numbers"] = 3 * tips_of(self)
+            self.load_centre = tuple(checked(centres, _LOAD_CENTRES, "load_centre", sizes).tolist())
         self.corrections, self.coefficients, self.gravity = corrections, None, None
         if corrections is not None:
             sizes["coefficients"] = len(corrections.functions.terms)
@@ -164,7 +173,7 @@ class Arm(eqx.Module):
         """Which columns readings may have after those of the joints: those stated, and those that corrections read."""
         read = () if self.corrections is None else self.corrections.functions.columns
         possible = tuple(name for name in COLUMNS if name in read or name in self.recorded) if read else self.recorded
-        return Beside(self.joints, self.recorded, possible, len(self.chains))
+        return Beside(self.joints, self.recorded, possible, len(self.chains), self.load_centre)
 
     @property
     def columns(self) -> int:
@@ -270,7 +279,8 @@ def arm_of(geometry: Geometry, limits: Limits | None = None) -> Arm:
         }
     arrays = {name: value for name, value in geometry._asdict().items() if name not in ("kinds", "beside")}
     arm = Arm(**arrays, limits=limits, **facts)
-    return arm if geometry.beside is None else reading_as(arm, geometry.beside.recorded)
+    beside = geometry.beside
+    return arm if beside is None else reading_as(arm, beside.recorded).replace(load_centre=beside.load_centre)
 
 
 def by_joint(arm: Arm, angular: Any, linear: Any) -> list[Any]:

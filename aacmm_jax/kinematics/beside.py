@@ -36,8 +36,9 @@ class Readings(NamedTuple):
     joints: Float[AnyArray, "n ... 1 N"]  # rad, mm of prismatic joints
     torques: Float[AnyArray, "n ... 1 N"] | None = None  # of the joints' drives, N m; N of prismatic joints
     directions: Float[AnyArray, "n ... 1 N"] | None = None  # 1: reached with rising readings, -1: falling, 0: unknown
-    load: Float[AnyArray, "1 ... 1 N"] | None = None  # at the tip, kg
+    load: Float[AnyArray, "1 ... 1 N"] | None = None  # kg
     thermometer: Float[AnyArray, "1 ... 1 N"] | None = None  # C
+    load_centre: tuple[float, ...] | None = None  # that of `Beside`
 
 
 @jax.tree_util.register_static
@@ -53,6 +54,7 @@ class Beside:
     recorded: tuple[str, ...] = ()  # what the arm is stated to have, in the order of `COLUMNS`
     possible: tuple[str, ...] = ()  # with what its corrections read
     chains: int = 0  # of a robot: the first column after the joints is the number of a pose's chain, and never missing
+    load_centre: tuple[float, ...] | None = None  # of mass, mm in the last frame, of each chain; None: the tip
 
     def width(self, names: Iterable[str]) -> int:
         """Number of columns of readings that have these beside those of the joints."""
@@ -91,7 +93,7 @@ class Beside:
     def split(self, rows: Float[AnyArray, "columns ..."]) -> Readings:
         """Readings with the columns first, by what they are."""
         found = {name: rows[part] for name, part in self.slices(rows.shape[0]).items() if part.start < part.stop}
-        return Readings(rows[: self.joints], **found)
+        return Readings(rows[: self.joints], **found, load_centre=self.load_centre)
 
     def is_clear(self, names: tuple[str, ...]) -> bool:
         """Whether readings that have these are taken to have them."""

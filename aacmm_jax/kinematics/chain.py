@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, scan, set_at
 from .beside import Beside, Readings
-from .joint_kinds import JointKinds, members_of, of_joints
+from .joint_kinds import JointKinds, members_of, of_joints, to_tips
 from .joint_kinds import tips_at as tips_at
 
 Vectors = Float[AnyArray, "... 3 N"]
@@ -214,6 +214,10 @@ def joint_motion_of_rows(geometry: Geometry, rows: Float[AnyArray, "n ... 1 N"])
     if corrections is None:
         return motion
     functions, moved = corrections.functions, motion
+    if members is not None:  # the links after one weigh on it too
+        whole_chains = to_tips(geometry, rows)
+        moved = joint_motion_of_rows(geometry._replace(corrections=None), whole_chains)
+        rows = whole_chains
     if functions.couplings and np.any(functions.by_gravity):
         # Where a reading moves another joint by as much as its own, the frames at the readings alone are far off.
         whole = full_couplings(functions, joints_first(geometry.coefficients, rows.ndim - 2))

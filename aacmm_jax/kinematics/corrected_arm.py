@@ -1,6 +1,7 @@
 """An arm with joint corrections: coefficients of known functions of the readings, 0 until they are calibrated."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -11,7 +12,7 @@ from ..core.errors import InputError
 from ..core.linear_algebra import independent_columns
 from ..core.numpy_or_jax import namespace, to_numpy
 from .arm import DOWN, Arm, correction_names, is_single, joint_limits, without_corrections
-from .beside import ALL, Beside
+from .beside import ALL
 from .chain import Corrections, Geometry, KnownFunctions, forward_pass, joint_motion, joints_first, of_joints
 from .correction_kinds import KILO, Loads, Term
 from .corrections import term_of, terms_of
@@ -84,7 +85,7 @@ def _determined(arm: Arm, terms: Sequence[Term], gravity: Float[np.ndarray, " 3"
     """The terms whose functions are no combination of a constant and of those before them, joint by joint."""
     if not terms:
         return ()
-    beside, random = Beside(arm.joints, ALL, ALL, len(arm.chains)), np.random.default_rng(0)
+    beside, random = replace(arm.beside, recorded=ALL, possible=ALL), np.random.default_rng(0)
     low, high = joint_limits(arm, None).T
     q = random.uniform(low, high, (_CONFIGURATIONS, arm.joints))
     q = np.hstack([q, beside.drawn(_CONFIGURATIONS, random)])

@@ -27,7 +27,6 @@ STANDARD_GRAVITY = 9.80665  # m/s^2, by definition
 _METRE = 1e-3  # m/mm
 KILO = 1e-3  # kN/N: with rad/(kN m), compliances are about as large as errors of angles
 _MASSES = "masses"
-AT_TIP = -1  # in place of a link's number
 
 Rows = Float[AnyArray, "rows ... 1 N"]
 
@@ -304,21 +303,10 @@ class Gravity(AbstractCorrection):
         return {self.model: self.usual_size if all(term.number for term in terms) else 1e-2}
 
     def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
-        xp, moved = namespace(forward), np.array([term.joint - 1 for term in terms])
-        weights, points = zip(*[self._pull(term, forward) for term in terms], strict=True)
-        if forward.members is None:
-            weight = np.array(weights).reshape(-1, *(1,) * forward.tip.ndim)
-        else:
-            weight = xp.stack([w + 0.0 * forward.members[0] for w in weights])
-        lever = xp.stack(points) - weight * forward.origin_before[moved]
-        moments = xp.moveaxis(_METRE * cross(forward.z_before[moved], lever), -2, 1)
-        count = moments.shape[0] * moments.shape[1]  # a -1 is undetermined where there are no poses
-        return moments.reshape(count, *moments.shape[2:])[..., None, :]
+        return moments_about(terms, [self._pull(term, forward) for term in terms], forward)
 
     def _pull(self, term: Term, forward: ForwardPass) -> tuple[Any, Float[AnyArray, "... 3 N"]]:
         """The weight that pulls at a joint, and the sum of weights times where they are, mm: 1 of a single link, kN."""
-        if term.number == AT_TIP:
-            return 1.0, forward.tip
         members: Any = np.ones(len(forward.origin)) if forward.members is None else forward.members
         if term.number:  # of a robot, nothing where the link is of another chain than the pose
             j = term.number - 1
@@ -329,3 +317,20 @@ class Gravity(AbstractCorrection):
         weights = {j: KILO * STANDARD_GRAVITY * term.loads.mass[j] * members[j] for j in links}
         pulls = [weights[j] * (forward.origin[j] + sum(centre[j][k] * axes[k][j] for k in range(3))) for j in links]
         return sum(weights.values()), functools.reduce(operator.add, pulls)
+
+
+def moments_about(
+    terms: Sequence[Term], pulls: Sequence[tuple[Any, Float[AnyArray, "... 3 N"]]], forward: ForwardPass
+) -> Rows:
+    """The moments about the joints of terms, three rows each, of weights and the sums of weights times where they are,
+    mm."""
+    xp, moved = namespace(forward), np.array([term.joint - 1 for term in terms])
+    weights, points = zip(*pulls, strict=True)
+    if forward.members is None:
+        weight = np.array(weights).reshape(-1, *(1,) * forward.tip.ndim)
+    else:
+        weight = xp.stack([w + 0.0 * forward.members[0] for w in weights])
+    lever = xp.stack(points) - weight * forward.origin_before[moved]
+    moments = xp.moveaxis(_METRE * cross(forward.z_before[moved], lever), -2, 1)
+    count = moments.shape[0] * moments.shape[1]  # a -1 is undetermined where there are no poses
+    return moments.reshape(count, *moments.shape[2:])[..., None, :]

@@ -87,6 +87,7 @@ def solve_to_targets(
     targets: Float[AnyArray, "c 3"],
     limits: Float[AnyArray, "n 2"],
     steps: int = _STEPS,
+    moving: Float[AnyArray, "n c"] | None = None,
 ) -> tuple[Float[AnyArray, "c columns"], Float[AnyArray, " c"]]:
     """Damped least-norm steps to the targets, within the limits, of at most 0.5 rad a joint; for any jit, vmap or loop.
 
@@ -101,6 +102,7 @@ def solve_to_targets(
         targets: Positions of the tip, one each ``(c, 3)``, mm.
         limits: Lowest and highest reading of each joint ``(n, 2)``, rad or mm.
         steps: Most steps.
+        moving: 1 where a joint may move, 0 where it keeps its reading ``(n, c)``; by default all may.
 
     Example:
         >>> limits = np.tile([-np.pi, np.pi], (6, 1))
@@ -112,17 +114,18 @@ def solve_to_targets(
     xp, low, high = namespace(geometry, q, targets), limits[:, 0, None, None], limits[:, 1, None, None]
     largest = LARGEST_STEP * xp.asarray(reading_units(geometry))[:, None, None]
 
-    def step(q: Any, wanted: Any) -> tuple[Any, Any]:
+    def step(q: Any, wanted: Any, *kept: Any) -> tuple[Any, Any]:
         forward = forward_pass(geometry, joint_motion_of_rows(geometry, q))
         gap = wanted - forward.tip
-        inverse = weighted_inverse(forward, 1e-2 * xp.sum(gap**2, axis=0) + 1e-12)
+        inverse = weighted_inverse(forward, 1e-2 * xp.sum(gap**2, axis=0) + 1e-12, *kept)
         change = xp.sum(inverse * gap[None], axis=1, keepdims=True)
         joints = xp.clip(of_joints(geometry, q) + xp.clip(change, -largest, largest), low, high)
         q = joints if len(q) == len(joints) else xp.concatenate([joints, q[len(joints) :]])
         return q, xp.any(xp.abs(gap) > EXACT, axis=0)
 
     # The step after the gap was seen to be closed takes what Newton's method leaves to rounding.
-    q = repeated(step, q.T[:, None, :], [targets.T], steps, together=True)
+    rows = [targets.T] if moving is None else [targets.T, moving]
+    q = repeated(step, q.T[:, None, :], rows, steps, together=True)
     tip = forward_pass(geometry, joint_motion_of_rows(geometry, q)).tip
     return q[:, 0].T, xp.linalg.norm(targets.T - tip, axis=0)
 
@@ -138,9 +141,13 @@ def least_norm_inverse(geometry: Geometry, q: Float[AnyArray, "N n"]) -> Float[A
     return weighted_inverse(forward_pass(geometry, joint_motion(geometry, q)), np.zeros(q.shape[0]))
 
 
-def weighted_inverse(forward: ForwardPass, damping: Float[AnyArray, "... N"]) -> ByJoint:
-    """`damped_inverse` by the readings, whose squares are counted in their units; rad and mm per mm."""
+def weighted_inverse(
+    forward: ForwardPass, damping: Float[AnyArray, "... N"], moving: Float[AnyArray, "n N"] | None = None
+) -> ByJoint:
+    """`damped_inverse` by the readings, whose squares are counted in their units; rad and mm per mm. Only joints that
+    are ``moving`` (1, not 0) take part."""
     columns = reading_columns(forward)
+    columns = columns if moving is None else columns * moving[:, None]
     if forward.kinds is None:
         return damped_inverse(columns, damping)
     units = namespace(columns).asarray(forward.kinds.units.reshape(-1, *(1,) * (columns.ndim - 1)))
@@ -172,22 +179,29 @@ def random_configurations(
     limits: Float[AnyArray, "n 2"],
     labels: Sequence[str] | None = None,
     beside: Float[np.ndarray, "m k"] | None = None,
+    held: Float[np.ndarray, "m n"] | None = None,
+    enough: int | None = None,
 ) -> Float[AnyArray, "m n"]:
     """One random configuration for each target, within the limits, exact to 1e-9 mm, with these columns ``beside`` the
-    joints, which a robot needs; `InputError`, with the target's label, if none is found."""
+    joints, which a robot needs, and the readings that are ``held`` (NaN of joints that may move); `InputError`, with
+    the target's label, if none is found. Where so many are ``enough``, others are NaN."""
     arm, targets, limits = to_numpy((arm, targets, limits))
     count = targets.shape[0]
     beside = np.zeros((count, 0)) if beside is None else beside
-    q, missing = np.zeros((count, arm.joints)), np.arange(count)
+    q, missing = np.full((count, arm.joints), np.nan), np.arange(count)
     for round_number in range(_ROUNDS * (1 + count // _BATCH)):
-        if not len(missing):
+        if count - len(missing) >= (count if enough is None else enough):
             return q
         # Every missing target is tried, several times at once if they are few; the first success counts.
         tried = np.resize(missing, _BATCH)
         key_of_round = jax.random.fold_in(key, round_number)
         start = limits[:, 0] + random_numbers("uniform", key_of_round, (_BATCH, arm.joints)) * np.ptp(limits, axis=1)
+        moving = None
+        if held is not None:
+            moving = np.isnan(held[tried].T).astype(float)
+            start = np.where(moving.T > 0, start, held[tried])
         start = np.hstack([start, beside[tried]])
-        solved, distance = solve_to_targets(*to_numpy((arm.geometry, start, targets[tried], limits)))
+        solved, distance = solve_to_targets(*to_numpy((arm.geometry, start, targets[tried], limits)), moving=moving)
         successes = np.flatnonzero(distance <= _TOLERANCE)[::-1]
         q[tried[successes]] = solved[successes, : arm.joints]
         missing = np.setdiff1d(missing, tried[successes])
@@ -208,6 +222,7 @@ def project_to_targets(
     targets: Float[np.ndarray, "N 3"],
     limits: JointLimits | None = None,
     steps: int = _STEPS,
+    kept: Bool[np.ndarray, "N n"] | None = None,
 ) -> tuple[Float[np.ndarray, "N columns"], Bool[np.ndarray, " N"]]:
     """Configurations ``(N, n)`` moved by least-norm steps until the tip is at its target, and whether it arrived.
 
@@ -218,6 +233,7 @@ def project_to_targets(
         targets: Positions of the tip, one each ``(N, 3)``, mm.
         limits: Lowest and highest reading of each joint ``(n, 2)``, rad or mm; by default none.
         steps: Most steps of each configuration.
+        kept: Joints that keep their reading ``(N, n)``; by default none.
 
     Example:
         >>> readings, arrived = aj.kinematics.project_to_targets(true, q[None], np.array([[100.0, 150.0, -100.0]]))
@@ -225,17 +241,24 @@ def project_to_targets(
         [[ 100.  150. -100.]] [ True]
     """
     allowed = np.tile([-np.inf, np.inf], (arm.joints, 1)) if limits is None else np.asarray(limits)
-    geometry = to_numpy(arm.geometry)
+    geometry, columns = to_numpy(arm.geometry), q.shape[1]
+    moving = np.zeros((len(q), 0)) if kept is None else (~kept).astype(float)
 
     def moved(rows: np.ndarray) -> np.ndarray:
-        return np.column_stack(solve_to_targets(geometry, rows[:, :-3], rows[:, -3:], allowed, steps))
+        readings, wanted, free = np.split(rows, [columns, columns + 3], axis=1)
+        return np.column_stack(
+            solve_to_targets(geometry, readings, wanted, allowed, steps, free.T if free.size else None)
+        )
 
-    solved = in_chunks(moved, np.hstack([q, targets]), ROWS)
+    solved = in_chunks(moved, np.hstack([q, targets, moving]), ROWS)
     return solved[:, :-1], solved[:, -1] <= ARRIVED
 
 
-def project_to_centroids(arm: Arm, capture: SocketPoses, targets_of: Arm | None = None) -> Float[np.ndarray, "N n"]:
-    """The configurations of a capture moved by least-norm steps until each tip is at its socket's centroid.
+def project_to_centroids(
+    arm: Arm, capture: SocketPoses, targets_of: Arm | None = None, kept: Bool[np.ndarray, "N n"] | None = None
+) -> Float[np.ndarray, "N n"]:
+    """The configurations of a capture moved by least-norm steps until each tip is at its socket's centroid, but for
+    joints that are ``kept``.
 
     ``targets_of`` is the arm that the centroids come from; by default the same. Tips of a nominal arm that is some mm
     wrong scatter, which makes directions look determined that are not, such as a rotation about the base.
@@ -243,7 +266,7 @@ def project_to_centroids(arm: Arm, capture: SocketPoses, targets_of: Arm | None 
     q, source = np.asarray(capture.q), arm if targets_of is None else targets_of
     tips = in_chunks(lambda rows: np.asarray(source.position(rows)), q)
     sums = np.stack([np.bincount(capture.owner, weights=tips[:, axis]) for axis in range(3)], axis=1)
-    moved, arrived = project_to_targets(arm, q, (sums / np.asarray(capture.sizes)[:, None])[capture.owner])
+    moved, arrived = project_to_targets(arm, q, (sums / np.asarray(capture.sizes)[:, None])[capture.owner], kept=kept)
     return np.where(arrived[:, None], moved, q)
 
 

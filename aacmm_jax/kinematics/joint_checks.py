@@ -86,10 +86,11 @@ def checked_readings(arm: Any, q: Numbers, like: AnyArray | None = None) -> Floa
 
 
 def check_chain(arm: Any, readings: AnyArray, where: str) -> None:
-    """Raise `InputError` where known readings of a robot, which ``where`` names, have a number that is no chain's."""
+    """Raise `InputError` where known readings of a robot, which ``where`` names, have a number that is no chain's, and
+    no link's."""
     if arm.chains and is_concrete(readings):
         chain = np.asarray(readings)[..., arm.joints]
-        wrong = ~np.isin(chain, np.arange(len(arm.chains)))
+        wrong = ~arm.geometry.kinds.is_body(chain)
         if np.any(wrong):
             raise InputError(
                 f"{where} has the chain {chain[wrong].flat[0]:g} in the column after the joints; give the number of a "

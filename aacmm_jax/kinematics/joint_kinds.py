@@ -13,6 +13,20 @@ from ..core.numpy_or_jax import AnyArray, namespace
 _UNIT = 1000.0  # mm: a slide of 1 mm counts as much as a rotation of 1 mrad, like the natural steps of parameters
 
 
+_LINK = 1e-3  # of a chain's number, for each joint
+
+
+def body_of(chain: Any, joint: Any = 0) -> Any:
+    """The number of the tip of a chain (0), or of the link after a joint of it, from 1."""
+    return chain + _LINK * joint
+
+
+def _link_of(numbers: Float[AnyArray, "..."]) -> Any:
+    """The joint before the link of each number; 0 of tips."""
+    xp = namespace(numbers)
+    return xp.round((numbers - xp.floor(numbers)) / _LINK).astype(int)
+
+
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class JointKinds:
@@ -56,18 +70,45 @@ class JointKinds:
         known, one that these poses are of."""
         if not self.chains:
             return int(self.read.sum())
-        counts = self.members[:, : len(self.read)] @ self.read
         known = isinstance(q, np.ndarray) and q.size
-        return int(counts[np.unique(q[..., len(self.read)].astype(int))].min() if known else counts.min())
+        numbers = np.unique(q[..., len(self.read)]) if known else np.arange(len(self.chains))
+        return int((self.members(numbers)[:, : len(self.read)] @ self.read).min())
 
     @cached_property
-    def members(self) -> Float[np.ndarray, "c m"]:
+    def _of_chain(self) -> Float[np.ndarray, "c m"]:
         """1 where a joint, and after the joints a coordinate of the tips, is of a chain."""
         table = np.zeros((len(self.chains), len(self.prismatic) + 3 * len(self.chains)))
         for number, joints in enumerate(self.chains):
             first = len(self.prismatic) + 3 * number
             table[number, [*joints, first, first + 1, first + 2]] = 1.0
         return table
+
+    @cached_property
+    def _depth(self) -> Float[np.ndarray, " m"]:
+        """How many joints of its chain come before each joint; of coordinates of the tips, all joints."""
+        depth = np.full(self._of_chain.shape[1], float(len(self.prismatic)))
+        for joints in self.chains:
+            depth[list(joints)] = np.arange(len(joints))
+        return depth
+
+    def members(self, numbers: Float[AnyArray, "..."]) -> Float[AnyArray, "... m"]:
+        """1 where a joint, and after the joints a coordinate of the tips, moves the body of which a pose is.
+
+        The number of a body is that of a chain, of which it is the tip; or, of the link after a joint (from 1), that of
+        a chain plus a thousandth of the joint's: `body_of`.
+        """
+        xp, chain = namespace(numbers), numbers.astype(int)
+        last = np.concatenate([self._depth[-1:], self._depth[: len(self.prismatic)]])
+        reach, depth = xp.asarray(last)[_link_of(numbers)][..., None], self._depth.reshape(*(1,) * numbers.ndim, -1)
+        return xp.where(xp.asarray(depth) <= reach, xp.asarray(self._of_chain)[chain], 0.0)
+
+    def is_body(self, numbers: Float[np.ndarray, "..."]) -> Bool[np.ndarray, "..."]:
+        """Whether each number is that of a chain's tip, or of a link of a chain."""
+        inside = (numbers >= 0) & (numbers < len(self.chains))
+        known = np.where(inside, numbers, 0.0)
+        chain, link = known.astype(int), np.minimum(_link_of(known), len(self.prismatic))
+        inside &= np.abs(numbers - body_of(chain, link)) < 1e-6
+        return np.asarray(inside & ((link == 0) | (self._of_chain[chain, link - 1] > 0)))
 
 
 def of_joints(geometry: Any, rows: Float[AnyArray, "columns ..."], offset: float = 1.0) -> Float[AnyArray, "n ..."]:
@@ -84,16 +125,23 @@ def of_joints(geometry: Any, rows: Float[AnyArray, "columns ..."], offset: float
 
 
 def members_of(geometry: Any, rows: Float[AnyArray, "columns ..."]) -> Float[AnyArray, "m ..."] | None:
-    """`JointMotion.members`, from the column after the joints of a robot: the number of a pose's chain, from 0."""
+    """`JointMotion.members`, from the column after the joints of a robot: the number of a pose's body."""
     if geometry.kinds is None or not geometry.kinds.chains:
         return None
-    xp, chain = namespace(rows), rows[geometry.alpha.shape[-1]]
-    return xp.moveaxis(xp.asarray(geometry.kinds.members)[chain.astype(int)], -1, 0)
+    return namespace(rows).moveaxis(geometry.kinds.members(rows[geometry.alpha.shape[-1]]), -1, 0)
+
+
+def to_tips(geometry: Any, rows: Float[AnyArray, "columns ..."]) -> Float[AnyArray, "columns ..."]:
+    """The readings of a robot with the whole chain of each pose, of whose link it may be."""
+    xp, joints = namespace(rows), geometry.alpha.shape[-1]
+    return xp.concatenate([rows[:joints], xp.floor(rows[joints : joints + 1]), rows[joints + 1 :]])
 
 
 def tips_at(geometry: Any, q: Float[AnyArray, "N columns"]) -> Float[AnyArray, "... 3"]:
-    """The probe of an arm, or that of each pose's chain ``(N, 3)``, in its last frame, mm."""
+    """The probe of an arm, or that of each pose's chain ``(N, 3)``, in its last frame, mm; 0 of a link."""
     if geometry.kinds is None or not geometry.kinds.chains:
         return geometry.probe
-    chain = q[:, geometry.alpha.shape[-1]].astype(int)
-    return geometry.probe.reshape(*geometry.probe.shape[:-1], -1, 3)[..., chain, :]
+    number = q[:, geometry.alpha.shape[-1]]
+    tips = geometry.probe.reshape(*geometry.probe.shape[:-1], -1, 3)[..., number.astype(int), :]
+    at_tip = (_link_of(number) == 0).reshape(*(1,) * (tips.ndim - 2), -1, 1)
+    return namespace(tips, q).where(at_tip, tips, 0.0)

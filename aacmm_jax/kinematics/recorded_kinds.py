@@ -11,7 +11,6 @@ from ..core.rotations import cross
 from .beside import Readings
 from .chain import ForwardPass, last_joints
 from .correction_kinds import (
-    AT_TIP,
     KILO,
     REFERENCE_TEMPERATURE,
     STANDARD_GRAVITY,
@@ -21,6 +20,7 @@ from .correction_kinds import (
     Rows,
     Sought,
     Term,
+    moments_about,
 )
 
 HANGS = "hang"  # the word of coefficients of play by gravity
@@ -106,8 +106,9 @@ class Expansion(AbstractCorrection):
 
 
 class Load(AbstractCorrection):
-    """Compliance under a load that was recorded beside the readings: a mass at the tip, kg, besides what the arm always
-    carries. A joint yields to the moment of its weight about the axis, rad/(kN m)."""
+    """Compliance under a load that was recorded beside the readings: a mass, kg, besides what the arm always carries,
+    at the tip, or with the centre of mass that the arm has as ``load_centre``. A joint yields to the moment of its
+    weight about the axis, rad/(kN m)."""
 
     model = "load"
     words = ("payload",)
@@ -122,9 +123,19 @@ class Load(AbstractCorrection):
     )
 
     def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
-        at_tip = [term._replace(number=AT_TIP) for term in terms]
-        moments = Gravity().values(at_tip, q, forward)
+        moments = moments_about(terms, [(1.0, self._centre(q, forward))] * len(terms), forward)
         return 0.0 * moments if q.load is None else KILO * STANDARD_GRAVITY * q.load * moments
+
+    def _centre(self, q: Readings, forward: ForwardPass) -> Float[AnyArray, "... 3 N"]:
+        """Where the load is, mm: its centre of mass, in the frame after the last joint that moves a pose."""
+        if q.load_centre is None:
+            return forward.tip
+        centre = np.array(q.load_centre).reshape(-1, 3, *(1,) * forward.tip.ndim)
+        if forward.members is not None:  # that of the chain of each pose
+            of_chain = forward.members[len(forward.origin) :]
+            centre = centre * of_chain.reshape(-1, 3, *of_chain.shape[1:])
+        along = centre.sum(axis=0)
+        return forward.origin[-1] + sum(along[k] * axis for k, axis in enumerate(forward.frame))
 
 
 class Torque(AbstractCorrection):

@@ -25,6 +25,7 @@ from .arm import Arm, arm_of, joint_limits, parameter_names, probe_names, value_
 from .axes_to_dh import Transform, dh_link, rotation
 from .chain import Corrections, KnownFunctions
 from .correction_kinds import Term
+from .joint_kinds import body_of
 from .recorded_kinds import HANGS
 
 _ROW = ("theta", "d", "a", "alpha", "beta")
@@ -52,13 +53,25 @@ class ChainOf(NamedTuple):
     names: Mapping[str, str]  # of the robot's parameter that each parameter of the arm is
     robot_joints: int  # of the robot
 
-    def readings(self, q: Numbers) -> Float[np.ndarray, "N columns"]:
-        """The robot's readings, with the number of the chain, at readings of the chain ``(N, n)``; other joints at
-        0."""
+    def readings(self, q: Numbers, link: int | None = None) -> Float[np.ndarray, "N columns"]:
+        """The robot's readings, with the number of the chain, at readings of the chain ``(N, n)``; other joints at 0.
+
+        With a ``link``, the poses are those of the frame after this joint of the chain, from 1, instead of its tip's.
+        """
         given = np.atleast_2d(np.asarray(q, dtype=float))
         if given.shape[-1] != len(self.joints):
             raise InputError(f"q has {given.shape[-1]} columns, but the chain has {len(self.joints)} joints.")
-        return np.column_stack([self.spread(given), np.full(len(given), self.number)])
+        return np.column_stack([self.spread(given), np.full(len(given), self.body(link))])
+
+    def body(self, link: int | None = None) -> float:
+        """The number that poses of the chain's tip have in the column after the joints, or those of a link."""
+        if link is None:
+            return self.number
+        if not 1 <= link <= len(self.joints):
+            raise InputError(
+                f"link {link} does not exist; give the number of a link of the chain, 1 to {len(self.joints)}."
+            )
+        return body_of(self.number, self.frames[link])
 
     def spread(self, values: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N joints"]:
         """Numbers of the chain's joints as those of the robot's; 0 of others."""
@@ -183,6 +196,7 @@ def _with_corrections(
         corrections=Corrections(KnownFunctions(tuple(kept.values())), nominal),
         coefficients=np.asarray(robot.coefficients)[places],
         gravity=base[:3, :3].T @ np.asarray(robot.gravity),
+        load_centre=robot.load_centre and robot.load_centre[3 * number : 3 * number + 3],
         **dict.fromkeys(robot.recorded, True),
     )
 
@@ -308,9 +322,11 @@ def together(
     values = dict(zip(_ROW, np.array(rows).T, strict=True))
     if not np.any(values["beta"]) and all(arm.beta is None for arm in arms.values()) and not any(map(_is_mount, place)):
         del values["beta"]
+    loads = [arm.probe if arm.load_centre is None else arm.load_centre for arm in arms.values()]
     return Arm(
         **values,
         probe=np.concatenate([np.asarray(arm.probe) for arm in arms.values()]),
+        load_centre=None if all(arm.load_centre is None for arm in arms.values()) else np.concatenate(loads),
         limits=limits,
         prismatic=prismatic,
         fixed=fixed,

@@ -306,7 +306,7 @@ class SearchRegion(NamedTuple):
         if kinds is None or not kinds.chains:
             return np.tile(units, (len(q), 1))
         chain = q[:, self.arm.joints].astype(int)
-        return np.column_stack([units * kinds.members[chain, : self.arm.joints], np.zeros(len(q))])
+        return np.column_stack([units * kinds.members(chain)[:, : self.arm.joints], np.zeros(len(q))])
 
 
 def search_region(

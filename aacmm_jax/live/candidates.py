@@ -13,21 +13,28 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..core.errors import InputError
+from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..data.capture_data import ReferenceLength
 from ..data.observations.observation import AbstractObservation
+from ..kinematics.arm import joint_limits
+from ..kinematics.chain import reading_units
+from ..kinematics.workspace import lowest_point
 from ..model.observed import Observed
 from ..planning.designs import Candidates, covariance_of, exchange
 from ..planning.kit import neighbours
 from ..planning.kit_placement import Thing, candidates_of_kit, set_up
+from ..planning.motion import joint_weights
 from ..planning.placement import LEAST_POSES
 from ..planning.problem import DesignProblem, PlanOptions
 from .places import Setup, by_thing, label_of
 
 TEN = 10  # poses that a prediction is for
-_STARTS = 2000  # random configurations in all things
+_STARTS, _OF_CAMERAS = 2000, 600  # random configurations in all things; with images, each of which has many rows
 _FIRST, _MOST, _ADDED = 30, 60, 3  # poses of a plan where nothing is stated; the most ahead; added to them at once
+_LEAST_ABOVE = 0.01  # share of random configurations above a table
 _SEARCHED = 400  # candidates that an exchange tries, drawn anew after every pose
+_SCALE_U = 1e-6  # of the scale of the nominal arm, where it is taken as exact
 
 Observations = Sequence[AbstractObservation]
 
@@ -62,16 +69,17 @@ class Search:
     def __init__(self, setup: Setup, options: PlanOptions | None = None):
         self.setup = setup
         if options is None:
-            heights = [float(place.position[2]) for place in setup.places if place.position is not None]
-            above = 0.0 if min(heights, default=0.0) >= 0 else -math.inf
-            options = PlanOptions.usual(setup.noise)._replace(space=setup.specification.space(), above=above)
+            options = PlanOptions.usual(setup.noise)._replace(space=setup.specification.space(), above=_table(setup))
         self.problem = DesignProblem.of(setup.specification.arm, options)
+        arm = self.problem.arm
+        self.weights = joint_weights(arm) / np.broadcast_to(reading_units(arm.geometry), (arm.joints,))
         self.things, self.unreached = dict[str, Thing](), dict[str, str]()
         drawn, groups = [], by_thing(setup)
         for name, places in groups.items():
             thing = Thing(places[0].item, places[0].thing)
             try:
-                poses = set_up(self.problem.region, thing, _STARTS // len(groups), retract=self.problem.options.retract)
+                starts = (_OF_CAMERAS if places[0].kind == "pixels" else _STARTS) // len(groups)
+                poses = set_up(self.problem.region, thing, starts, retract=self.problem.options.retract)
             except InputError as error:
                 self.unreached[name] = str(error)
                 continue
@@ -79,6 +87,8 @@ class Search:
             drawn.append(poses)
         if not self.things:
             raise InputError(next(iter(self.unreached.values())))
+        measured = setup.lengths or arm.prismatic or any(part.fixes_scale for part in drawn)
+        self.scaled = bool(measured)  # whether anything determines the scale; else that of the nominal arm is taken
         self._names = {place.name: i for i, place in enumerate(setup.places)}
         self._pools: dict[tuple[str, str], Pool] = {}
         every = np.full(len(setup.places), LEAST_POSES)
@@ -91,6 +101,10 @@ class Search:
         self._sets = [*first, self._near(first[0])]
         if len(first) == 1:
             self.planned = self.chosen(self.pool().candidates, len(self.planned), self.planned, every, sweeps=2)
+
+    def away(self, q: Float[np.ndarray, "... n"], other: Float[np.ndarray, "... n"]) -> Float[np.ndarray, "..."]:
+        """How far joints move from one configuration to another, summed, rad."""
+        return np.asarray(np.abs((q - other) * self.weights).sum(axis=-1))
 
     def chosen(
         self,
@@ -171,7 +185,13 @@ class Search:
             columns = {name: len(self.problem.space.names) + at for name, at in positions.items()}
         most = max(part.rows.shape[1] for part in parts)
         rows = [np.pad(part.rows, ((0, 0), (0, most - part.rows.shape[1]), (0, 0))) for part in parts]
-        candidates = parts[0]._replace(rows=np.concatenate(rows), owner=np.array(places))
+        base = parts[0].base.copy()
+        if not self.scaled:
+            space = self.problem.space
+            along = np.where(space.lengths, np.asarray(space.vector()), 0.0)  # natural steps of lengths are mm
+            along /= _SCALE_U * (along @ along)
+            base[: len(along), : len(along)] += np.outer(along, along)
+        candidates = parts[0]._replace(rows=np.concatenate(rows), owner=np.array(places), base=base)
         return Pool(np.concatenate(q), np.array(places), candidates, columns)
 
     def _stated(self, drawn: Observations) -> tuple[list[AbstractObservation], list[int]]:
@@ -197,6 +217,17 @@ class Search:
             same = (np.asarray(around.q)[:, None] == np.asarray(poses.q)).all(axis=2).any(axis=1)
             near.append(around.select(np.flatnonzero(~same)) if not same.all() else poses)
         return near
+
+
+def _table(setup: Setup) -> float:
+    """Height of the table, mm: at the base, unless a place is below it or the arm hardly ever is above it, as where the
+    first axis points down."""
+    arm = to_numpy(setup.specification.arm)
+    ends = np.asarray(joint_limits(arm, None))
+    q = np.random.default_rng(0).uniform(ends[:, 0], ends[:, 1], (_STARTS, arm.joints))
+    heights = [float(place.position[2]) for place in setup.places if place.position is not None]
+    below = min(heights, default=0.0) < 0 or np.mean(lowest_point(arm, q) >= 0) < _LEAST_ABOVE
+    return -math.inf if below else 0.0
 
 
 def _places_of(poses: AbstractObservation) -> list[str]:

@@ -21,22 +21,20 @@ from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..kinematics.arm import Arm
-from ..kinematics.chain import reading_units
 from ..kinematics.parameters import Bounds, Parameters
 from ..kinematics.priors import Prior, default_prior
-from ..kinematics.workspace import reached
 from ..model.observed import Observed
 from ..pipeline.single import calibrate, identify
 from ..planning.designs import Candidates
 from ..planning.kit_placement import rows_by_pose, rows_of_relations
-from ..planning.motion import approaches, joint_weights, move_contacts
 from ..planning.placement import LEAST_POSES
 from ..planning.problem import PRIOR, PlanOptions
 from ..uncertainty.coverage import LEVEL
 from ..uncertainty.linearisation import Linearisation
 from .candidates import Search
-from .limits import gained, progress
+from .limits import progress
 from .places import Setup, TakenPose, capture_of
+from .proposals import NextPose, Proposals
 
 _FREEDOM = 4.0  # degrees of freedom that the usual noise counts
 _WRONG, _RIGHT = 1e-3, 0.05  # probability, times the number of poses, of an outlier; probability of one that fits again
@@ -44,9 +42,7 @@ _NEWER = 0.8  # of the largest ratio, from which the newest pose is the outlier
 _OPEN = 1e-3  # eigenvalue of I - H below which nothing else shows an error of the pose
 _LEAST_U = 1e-4  # mm: smallest standard uncertainty of what is certified
 _ROUNDS = 3  # of leaving out poses
-_OTHER_PLACE = 1.0  # rad: what a change of place counts besides its motion
-_HERE = 0.15  # rad, summed over joints: nearer than this a pose is the one that was taken last
-_MOVES = 6  # that are checked for collisions
+_STEPS = 30  # of a calibration, which begins at the one before; few poses hardly determine where it ends
 
 
 class PoseResidual(NamedTuple):
@@ -72,20 +68,8 @@ class Guidance(NamedTuple):
     stop: bool  # whether the target is met
     sentences: tuple[str, ...]  # findings
     again: TakenPose | None  # the newest pose, where it is an outlier
-    last: str  # the place of the newest pose
     known: Candidates  # the candidates and what is known so far
     ahead: tuple[int, ...]  # the candidates that are planned
-
-
-class NextPose(NamedTuple):
-    """A pose to take: its place, the readings to go to, why, how far the joints move, rad, and the readings of its
-    approach point, if it has one."""
-
-    place: str
-    q: Float[np.ndarray, " n"]
-    why: str
-    distance: float
-    approach: Float[np.ndarray, " n"] | None = None
 
 
 class Guide:
@@ -104,22 +88,21 @@ class Guide:
         self.setup, self.target = setup, target
         self.search = Search(setup, options)
         self._wrong: frozenset[int] = frozenset()
-        self._last: Float[np.ndarray, " n"] | None = None  # readings of the newest pose
+        self._taken: list[TakenPose] = []  # those that count, in order
         self._newest, self._start, self._ahead = 0, None, list(self.search.planned)
         arm, given = self.search.problem.arm, setup.specification
         usual = {} if arm.corrections is None else {k: float(v) for k, v in default_prior(arm).sd.items()}
         widths = usual | {"lengths": given.length, "angles": given.angle} | dict(given.override)
         self._prior = Prior({name: width for name, width in widths.items() if width > 0})
-        self._weights = joint_weights(arm) / np.broadcast_to(reading_units(arm.geometry), (arm.joints,))
 
     def calibrated(self, poses: Sequence[TakenPose]) -> Guidance | None:
         """The calibration of the poses so far; None where there are none, or they determine none yet."""
         poses = [pose for pose in poses if not pose.excluded]
+        self._taken = sorted(poses, key=lambda pose: pose.number)
         if not poses:
-            self._ahead, self._last = list(self.search.planned), None
+            self._ahead = list(self.search.planned)
             return None
-        last = max(poses, key=lambda pose: pose.number)
-        self._last = last.q[: len(self._weights)]
+        last = self._taken[-1]
         wrong = self._wrong & {pose.number for pose in poses}
         # Poses that do not determine where their thing stands wait for others in it, those of the last pose first.
         waiting = [pose for pose in poses if self._thing(pose) == self._thing(last)]
@@ -144,92 +127,46 @@ class Guide:
         return self._guidance(poses, solution, last)
 
     def next_pose(
-        self, guidance: Guidance | None, q: Float[np.ndarray, " n"] | None, place: str | None = None
-    ) -> NextPose | None:
-        """The pose to take next: of those that are planned the nearest to the present readings ``q`` that the joints
-        can move to without a collision; in ``place``, where that is given. An outlier is taken again first."""
-        again = None if guidance is None else guidance.again
-        if again is not None and place in (None, again.place) and guidance is not None:
+        self, guidance: Guidance | None, q: Float[np.ndarray, " n"] | None, place: str | None = None,
+        skipped: Sequence[NextPose] = (),
+    ) -> NextPose | None:  # fmt: skip
+        """The pose to take next from the present readings ``q``, in ``place`` where that is given; an outlier is taken
+        again first. None where none is left that was not ``skipped``."""
+        ahead, known = self._ahead or self.search.planned, self.search.pool().candidates
+        arm, positions, again = self.search.problem.arm, dict[str, Any](), None
+        if guidance is not None:
+            ahead, known, again = guidance.ahead, guidance.known, guidance.again
+            arm, positions = guidance.arm, guidance.positions
+        proposals = Proposals(self.search, known, arm, positions, self._taken, q, skipped)
+        if guidance is not None and again is not None and place in (None, again.place):
             away = float(np.linalg.norm(guidance.poses[again.number].residual))
-            return self._proposed(
-                again.place, again.q, f"Pose {again.number} is {away:.2g} mm off: take it again.", q, None
-            )
-        pool = self.search.pool()
-        known, ahead = (
-            (pool.candidates, self._ahead or self.search.planned)
-            if guidance is None
-            else (guidance.known, guidance.ahead)
-        )
-        here = place if place is not None else None if guidance is None else guidance.last
-        index = next((i for i, at in enumerate(self.setup.places) if at.name == here), -1)
-        rows = np.array(ahead, dtype=int)
-        if place is not None:
-            rows = rows[known.owner[rows] == index]
-            if not len(rows):
-                inside = np.flatnonzero(known.owner == index)
-                if not len(inside):
-                    return None
-                part = known._replace(rows=known.rows[inside], owner=known.owner[inside])
-                rows = inside[self.search.chosen(part, 1)]
-        best, distance = self._nearest(pool.q, known, rows, q, index)
-        why = gained(self.search.problem, known, best)
-        name = self.setup.places[int(known.owner[best])].name
-        return self._proposed(name, pool.q[best], why, q, guidance)._replace(distance=distance)
-
-    def _nearest(
-        self, q: np.ndarray, known: Candidates, rows: np.ndarray, now: np.ndarray | None, here: int
-    ) -> tuple[int, float]:
-        """The candidate with the shortest motion, in another place only where that is much shorter."""
-        if now is None:
-            return int(rows[0]), 0.0
-        away = np.abs((q[rows] - now) * self._weights).sum(axis=1)
-        if self._last is not None:  # what was just taken is not worth taking again
-            apart = np.abs((q[rows] - self._last) * self._weights).sum(axis=1) > _HERE
-            rows, away = (rows[apart], away[apart]) if np.any(apart) else (rows, away)
-        order = np.argsort(away + _OTHER_PLACE * (known.owner[rows] != here))
-        first = rows[order[:_MOVES]]
-        contacts = move_contacts(self.search.problem.region, np.tile(now, (len(first), 1)), q[first])
-        free = next((i for i, contact in enumerate(contacts) if contact is None), 0)
-        return int(first[free]), float(away[order[free]])
-
-    def _proposed(
-        self, place: str, q: np.ndarray, why: str, now: np.ndarray | None, guidance: Guidance | None
-    ) -> NextPose:
-        """A pose with its tip where the place is, by the arm as it is calibrated so far."""
-        region, approach = self.search.problem.region, None
-        thing = self.search.things[self.setup.place(place).thing.name]
-        if guidance is not None and place in guidance.positions:
-            seat = thing.seat(region._replace(arm=guidance.arm))
-            there, good = reached(seat, q[None], guidance.positions[place][None])
-            q = there[0] if good[0] else q
-        retract, seat = self.search.problem.options.retract, thing.seat(region)
-        if retract and thing.item.has_cone and seat.cones is not None:
-            above, good = approaches(seat, q[None], seat.cones.normals[:1], retract)
-            approach = above[0] if good[0] else None
-        distance = 0.0 if now is None else float(np.abs((q - now) * self._weights).sum())
-        return NextPose(place, q, why, distance, approach)
+            once_more = proposals.again(again, f"Pose {again.number} is {away:.2g} mm off: take it again.")
+            if once_more is not None:
+                return once_more
+        return proposals.best(ahead, place)
 
     def _solved(self, poses: Sequence[TakenPose], wrong: frozenset[int]) -> "_Solution":
         """The calibration without wrong poses, and the rows of all poses at it."""
         problem = self.search.problem
-        capture, _ = capture_of(self.setup, [pose for pose in poses if pose.number not in wrong] or poses)
+        whole, numbers = capture_of(self.setup, poses)
+        kept = [pose for pose in poses if pose.number not in wrong]
+        capture = capture_of(self.setup, kept)[0] if wrong and kept else whole
         endless = np.full(len(problem.space.names), np.inf)
         bounds, options = Bounds(problem.space, -endless, endless), {"start": self._start, "noise": problem.noise}
-        options |= {"prior": self._prior, "replace_noise": False}
+        options |= {"prior": self._prior, "replace_noise": False, "max_steps": _STEPS}
         if capture.lengths or fixes_scale(capture):
             result = calibrate(problem.arm, capture, bounds, **options, shared_errors=False, undetermined="ignore")
         else:  # the prior holds the scale
             result = identify(problem.arm, capture, bounds, **options, hold=None)
         vector = np.asarray(result.parameters)
         self._start = vector if np.all(np.isfinite(vector)) else None
-        whole, numbers = capture_of(self.setup, poses)
         arm = to_numpy(result.arm)
         observed = to_numpy(Observed.of(whole, arm))
         geometry = {name: np.asarray(values) for name, values in result.observed.geometry.items()}
         if any(name not in geometry for name in observed.blocks):
             alone = to_numpy(Observed.of(without_lengths(whole), arm))
-            kept = {name: values for name, values in geometry.items() if name in alone.blocks}
-            geometry = alone.split(np.asarray(fit_geometry(arm, alone, kept, problem.noise).geometry))
+            near = {name: values for name, values in geometry.items() if name in alone.blocks}
+            geometry = alone.split(np.asarray(fit_geometry(arm, alone, near, problem.noise).geometry))
         z = np.concatenate([vector, *(geometry[name] for name in observed.blocks)])
         linear = Linearisation.at(
             observed, Parameters(arm, problem.space.names), z, noise=problem.noise, least=_LEAST_U
@@ -268,7 +205,7 @@ class Guide:
             arm=solution.linear.space.base, poses=by_number, positions=positions, u_length=found.u,
             u_after_ten=found.u_after_ten, limits=found.limits, stop=found.met,
             sentences=(*self._sentences(poses, by_number), *self.search.unreached.values()), again=again,
-            last=newest.place, known=solution.known, ahead=tuple(found.ahead),
+            known=solution.known, ahead=tuple(found.ahead),
         )  # fmt: skip
 
     def _sentences(self, poses: Sequence[TakenPose], found: Mapping[int, PoseResidual]) -> list[str]:
@@ -286,8 +223,7 @@ class Guide:
             return
         self._newest = newest.number
         pool, ahead = self.search.pool(), np.array(self._ahead)
-        q = newest.q[: pool.q.shape[1]]
-        away = np.abs((pool.q[ahead] - q) * self._weights).sum(axis=1)
+        away = self.search.away(pool.q[ahead], newest.q[: pool.q.shape[1]])
         elsewhere = np.array([self.setup.places[i].name != newest.place for i in pool.place[ahead]])
         self._ahead.pop(int(np.argmin(away + 1e3 * elsewhere)))
 

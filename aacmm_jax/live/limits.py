@@ -47,7 +47,7 @@ def progress(
     """
     u = scale * search.u(known.base)
     floor = scale * search.u(known.base + _ENDLESS * taken)
-    met, determined = target is not None and u <= target, u < _UNKNOWN * scale
+    met, determined = search.scaled and target is not None and u <= target, u < _UNKNOWN * scale
     aim = target / scale if target is not None and determined and floor < target and not met else None
     planned = search.ahead(known, ahead, least, aim)
     after = scale * search.u(search.ten(known, planned))
@@ -55,6 +55,12 @@ def progress(
         limits = f"These poses do not determine lengths yet; {_least_known(search, known)}"
         return Progress(None, after if after < _UNKNOWN * scale else None, limits, False, planned)
     length = f"U of {search.problem.check_length:.0f} mm"
+    if not search.scaled:
+        limits = (
+            f"{length} falls to {after:.2g} mm with {TEN} more poses if the scale of the nominal arm is exact; add a "
+            "reference length, or an artefact that is certified."
+        )
+        return Progress(u, after, limits, False, planned)
     if met:
         return Progress(u, after, f"{length} is {u:.2g} mm: the target of {target:.2g} mm is met.", True, planned)
     if floor > (_CLOSE * u if target is None else target):

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+BUTTONS = ("button", "skip")
+
 
 class Sample(NamedTuple):
     """What one device has read at one moment; any part may be missing.
@@ -14,7 +16,7 @@ class Sample(NamedTuple):
         time: Of the device's own clock, or of the arrival, s.
         q: Joint readings ``(n,)``, rad, or mm of prismatic joints.
         columns: What was recorded beside them by name: ``temperature_C``, ``load_kg``, ``torque_1`` ..., and
-            ``button`` (1 while it is pressed).
+            ``button`` and ``skip`` (1 while they are pressed): take this pose, and propose another.
         measured: What an instrument measured, by the entries of its observation: ``points`` (a tracked point ``(3,)``
             in the station's frame, mm), ``rotations`` ``(3, 3)``, ``values`` (a distance, mm), ``corners`` ``(c, 2)``
             (px) with ``ids`` ``(c,)``.

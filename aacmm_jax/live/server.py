@@ -35,6 +35,7 @@ _FILES = {
 _ACTIONS: dict[str, dict[str, type]] = {
     "take": {},
     "undo": {},
+    "skip": {},
     "exclude": {"pose": int, "excluded": bool},
     "mark": {"text": str},
     "temperature": {"celsius": float},

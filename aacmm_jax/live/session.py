@@ -16,18 +16,17 @@ from jaxtyping import Float
 
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
-from ..data.recording import Recording
-from ..files.captures import save_capture
 from ..kinematics.arm import Arm, by_joint
 from . import guidance as guiding
 from .captured import Captured, Whereabouts
 from .devices import open_device
 from .devices.device import AbstractDevice
 from .journal import Journal, journal_of
-from .places import COLUMNS, Place, Setup, TakenPose, capture_of
-from .samples import Sample, mean_measured
+from .places import COLUMNS, Place, Setup
+from .samples import BUTTONS, Sample, mean_measured
 from .shown import headline, links_of, shown_readings, state_of
 from .stillness import Rest, Stillness
+from .written import written
 
 _LOOK_EVERY = 0.1  # s of rest
 _MOST_MEASURED = 500
@@ -82,7 +81,9 @@ class Session:
         self._version = self._sound = 0
         self._where = Whereabouts(setup, self._arm, (), None)
         self._next: guiding.NextPose | None = None
+        self._skipped: list[guiding.NextPose] = []
         self._busy: str | None = None
+        self._planning = True  # until the first pose is proposed
         self._message = ""
         self._again: tuple[int | None, float] = None, np.inf  # pose that is to be taken again, and when that was said
         self._shown: tuple[int, dict[str, Any]] = -1, {}  # the version, and what is seen of it
@@ -95,7 +96,7 @@ class Session:
         self._looked_at = -np.inf  # and when it was last looked at
         self._taken_q: Float[np.ndarray, " n"] | None = None
         self._stillness = Stillness(self._arm.joints)
-        self._button = False
+        self._pressed: frozenset[str] = frozenset()  # buttons of the arm
         self._journal, self._closed = Journal(journal_of(self.path)), False
         self._devices: list[AbstractDevice] = []
         self._threads: list[threading.Thread] = []
@@ -169,13 +170,21 @@ class Session:
             self._forced = None if name is None else self.setup.place(name).name
             self._changed(compute=True)
 
+    def skip(self) -> None:
+        """Ask for another pose than the one that is proposed, which is not proposed again before the next start."""
+        with self._lock:
+            if self._next is None:
+                raise InputError("no pose is proposed at present.")
+            self._skipped.append(self._next)
+            self._changed(compute=True)
+
     def finish(self, calibrate: bool = True) -> list[str]:
         """Write the capture, and the calibration with its report; the names of the files. The session goes on."""
         with self._lock:
             poses, self._busy = list(self._captured.poses), "Calibrating" if calibrate else "Writing"
             self._version += 1
         try:
-            paths = self._written(poses, calibrate)
+            paths = written(self.setup, poses, self.path, calibrate)
         finally:
             with self._lock:
                 self._busy = None
@@ -190,7 +199,7 @@ class Session:
         self._wake.set()
         for thread in self._threads:
             if thread is not threading.current_thread():
-                thread.join(5.0)
+                thread.join(5.0 if thread is not self._threads[0] else 0.5)  # nobody waits for guidance
         for device in self._devices:
             device.close()
         self._devices = []
@@ -219,7 +228,8 @@ class Session:
             if self._shown[0] != self._version:
                 state = state_of(self.setup, self._captured, self._where, self._next, self.target)
                 unread = [device.name for device in self._devices if not device.connected]
-                state |= {"headline": headline(self._busy, unread, state), "auto": self._auto}
+                busy = self._busy or ("Planning the first poses" if self._planning and not unread else None)
+                state |= {"headline": headline(busy, unread, state), "auto": self._auto}
                 self._shown = self._version, state | {"busy": self._busy, "message": self._message}
             return live | self._shown[1]
 
@@ -281,7 +291,7 @@ class Session:
 
     def _take(self, rest: Rest, place: Place) -> int:
         measured = mean_measured(self._measured) if place.is_free else {}
-        columns = {name: value for name, value in self._columns.items() if name != "button"}
+        columns = {name: value for name, value in self._columns.items() if name not in BUTTONS}
         if self._captured.temperature is not None:
             columns[COLUMNS["thermometer"]] = self._captured.temperature
         number = self._captured.number + 1
@@ -300,7 +310,7 @@ class Session:
     def _read_device(self, device: AbstractDevice) -> None:
         while not self._stop.is_set():
             samples = device.read()
-            raw = b"" if self._stream is None else device.raw()
+            raw = device.raw()
             if not samples and not raw:
                 continue
             with self._lock:
@@ -312,13 +322,14 @@ class Session:
                     self._say(error)
 
     def _add(self, samples: Iterable[Sample]) -> None:
-        pressed = False
+        pressed: set[str] = set()
         for sample in samples:
             self._columns |= sample.columns
             if sample.measured:
                 self._measured = [*self._measured[-_MOST_MEASURED:], sample.measured]
-            button = bool(self._columns.get("button", 0))
-            pressed, self._button = pressed or (button and not self._button), button
+            now = frozenset(name for name in BUTTONS if self._columns.get(name))
+            pressed |= now - self._pressed
+            self._pressed = now
             if sample.q is not None:
                 self._q = sample.q
                 if sample.time < self._sample_time:  # the device's clock began anew
@@ -329,8 +340,10 @@ class Session:
                     self._measured = []
                 self._sample_times.append(sample.time)
                 self._take_by_itself()
-        if pressed:
+        if "button" in pressed:
             self.take()
+        if "skip" in pressed and self._next is not None:
+            self.skip()
 
     def _take_by_itself(self) -> None:
         rest = self._stillness.rest
@@ -343,6 +356,7 @@ class Session:
         if self._taken_q is not None and rest.since <= self._again[1]:
             moved = np.abs(rest.q - self._taken_q) / np.array(by_joint(self._arm, 1.0, 1000.0))
             if np.max(moved) < _APART:
+                self._taken_until = rest.until  # also while it ends, with readings of the next motion in it
                 return
         place = self._place_at(self._tip_of(rest.q))
         if place is not None:
@@ -355,7 +369,7 @@ class Session:
                 continue
             self._wake.clear()
             with self._lock:
-                poses, q, forced = list(self._captured.poses), self._q, self._forced
+                poses, q, forced, skipped = list(self._captured.poses), self._q, self._forced, list(self._skipped)
             found, proposed, message = None, None, ""
             try:
                 guide = guiding.Guide(self.setup, self.target) if guide is None else guide
@@ -363,12 +377,12 @@ class Session:
                     found = guide.calibrated(poses)
                 except InputError as error:  # of data that do not determine enough yet
                     message = str(error)
-                proposed = guide.next_pose(found, q, forced)
+                proposed = guide.next_pose(found, q, forced, skipped)
             except Exception as error:  # poses are taken without guidance, too
                 message = in_words(error)
             with self._lock:
                 self._where = Whereabouts(self.setup, self._arm, self._captured.poses, found)
-                self._next, self._message = proposed, message
+                self._next, self._message, self._planning = proposed, message, False
                 again = found.again.number if found is not None and found.again is not None else None
                 if again != self._again[0]:
                     self._again = again, np.inf if again is None else self._sample_time
@@ -376,26 +390,6 @@ class Session:
                 if proposed is not None:
                     for device in self._devices:
                         device.asked(self.setup.place(proposed.place), proposed.q)
-
-    def _written(self, poses: list[TakenPose], calibrate: bool) -> list[str]:
-        from ..files.calibrations import save_calibration
-        from ..pipeline.capture_calibration import calibrate_capture
-        from ..report import write_report
-
-        capture, _ = capture_of(self.setup, poses)
-        recording = Recording(
-            capture, self.setup.specification, usual=self.setup.noise, measured=time.strftime("%Y-%m-%d")
-        )
-        save_capture(self.path, recording)
-        paths = [str(self.path)]
-        if calibrate:
-            scaled = capture.lengths or any(observation.fixes_scale for observation in capture.observations)
-            calibration = self.path.with_name(f"{self.path.stem}-calibration.h5")
-            save_calibration(calibration, calibrate_capture(recording, scale="measured" if scaled else "nominal"))
-            page = calibration.with_suffix(".html")
-            write_report(calibration, page)
-            paths += [str(calibration), str(page)]
-        return paths
 
 
 def in_words(error: Exception) -> str:

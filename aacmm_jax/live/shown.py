@@ -125,4 +125,9 @@ def headline(busy: str | None, unread: Sequence[str], state: dict[str, Any]) -> 
         return f"Pose {last['number']} does not fit: take it again in {last['place']}"
     if state["stop"]:
         return "The target is met: finish, or take more poses"
-    return f"Go to {state['next']['place']} and hold still" if state["next"] else "Take a pose"
+    if not state["next"]:
+        return "Take a pose"
+    place = next(place for place in state["places"] if place["name"] == state["next"]["place"])
+    alone = len(state["places"]) == 1
+    goal = place["name"] if place["position"] else f"the next pose{'' if alone else ' for ' + place['name']}"
+    return f"Go to {goal} and hold still"

@@ -12,7 +12,7 @@ from ..core.errors import InputError
 from ..core.text import printable
 from .session import Session
 
-KEYS = "space take   u undo   x exclude   s new session   a automatic   f finish   q quit"
+KEYS = "space take   u undo   x exclude   n another pose   s new session   a automatic   f finish   q quit"
 _POSES = 8  # of the last ones that are shown
 _BELL = "\a"
 
@@ -73,6 +73,9 @@ def _obey(session: Session, key: str, state: dict[str, Any]) -> str:
         last = state["poses"][-1]
         session.exclude(last["number"], not last["excluded"])
         return f"Pose {last['number']} is {'used again' if last['excluded'] else 'excluded'}."
+    if key == "n":
+        session.skip()
+        return "Another pose will be proposed."
     if key == "s":
         session.mark("")
         return "A new session begins."

@@ -25,6 +25,7 @@ from ..kinematics.chain import Geometry, JointMotion, forward_pass, joint_motion
 from ..kinematics.parameters import Parameters
 from ..solver.arrow import split
 from .layout import Layout, layout_of, unknowns_of
+from .read_once import ReadOnce, joints_read_once
 from .sockets import means_over_sockets
 
 _STEPS = {"mm": 1.0, "rad": 1e-3, "px": 1.0, "1": 1.0}  # natural steps, as those of the arm's parameters
@@ -42,12 +43,21 @@ class Observed:
     u: Float[AnyArray, " l"]
     ends: tuple[tuple[str, str], ...] = static()  # names of the positions at their ends
     layout: Layout = static()
+    read_once: ReadOnce = static()  # joints whose errors are none of some poses
 
     @classmethod
-    def of(cls, capture: Capture, arm: Arm | None, *, lengths: bool = True, shared: Sequence[str] = ()) -> "Observed":
+    def of(
+        cls,
+        capture: Capture,
+        arm: Arm | None,
+        *,
+        lengths: bool = True,
+        shared: Sequence[str] = (),
+        read_once: ReadOnce | None = None,
+    ) -> "Observed":
         """What a capture observed, by an arm with such joints; None where only what is unknown matters. Without its
-        reference ``lengths`` sockets are independent of each other; ``shared`` as for `layout_of`. Raises `InputError`
-        for a batch of captures."""
+        reference ``lengths`` sockets are independent of each other; ``shared`` as for `layout_of`; ``read_once`` is
+        that of other readings, where those of the capture are traced. Raises `InputError` for a batch of captures."""
         check_one_capture(capture)
         capture = to_numpy(capture)
         if arm is not None:
@@ -65,6 +75,7 @@ class Observed:
             u=xp.stack([length.u for length in references]) if references else np.zeros(0),
             ends=ends,
             layout=layout,
+            read_once=joints_read_once(observations, arm, ends_of(capture)) if read_once is None else read_once,
         )
 
     def moved(
@@ -76,6 +87,17 @@ class Observed:
 
     def _changed(self, observations: tuple[AbstractObservation, ...]) -> dict[str, Any]:
         return {"observations": observations, "stacks": _stacks(observations, self.layout)}
+
+    @cached_property
+    def counted(self) -> Float[np.ndarray, "n M"] | None:
+        """1 where an error of a joint's reading is one of a pose, else 0; None where all are."""
+        if not self.read_once:
+            return None
+        assert self.motion is not None
+        counted = np.ones((len(self.motion.cos), len(self.q)))
+        for joint, poses in self.read_once:
+            counted[joint, list(poses)] = 0.0
+        return counted
 
     @cached_property
     def blocks(self) -> dict[str, tuple[str, ...]]:

@@ -46,6 +46,8 @@ def arm_errors(point: PointRows, observed: Observed) -> list[ArmErrors]:
     assert isinstance(forward, ForwardPass)  # a batch needs no covariance of its arms' errors
     xp = namespace(forward)
     readings, rotations = reading_columns(forward), reading_rotations(forward)  # (n, 3, N)
+    if observed.counted is not None:
+        readings, rotations = (columns * xp.asarray(observed.counted)[:, None] for columns in (readings, rotations))
     # An arm whose tips err by s turns them by about s over its size.
     size = xp.sqrt(xp.mean(xp.sum(forward.tip**2, axis=0)))
     errors = []

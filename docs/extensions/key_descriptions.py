@@ -103,6 +103,7 @@ DESCRIPTIONS = {
     "directions": "In an arm file, whether readings have the direction of approach of each joint beside them; in a "
     "manifest, the columns of these directions: 1 after a rising reading, -1 after a falling one, 0 unknown.",
     "load": "Whether readings have the mass at the tip beside them.",
+    "load_centre": "Centre of mass of the load, in the frame of the probe; by default the tip.",
     "load_kg": "Mass at the tip, kg, besides that of the arm and its tool.",
     "thermometer": "Whether readings have the arm's temperature as a last column.",
     "identification": "Free and fixed parameters, and the bounds of the free parameters.",

@@ -19,6 +19,9 @@ BASE = np.diag([-1.0, -1.0, 1.0, 1.0]) + np.array([[0, 0, 0, 500.0]] + 3 * [[0] 
 TWO = aj.kinematics.together({"left": ARM, "right": ARM}, bases={"right": BASE})
 BOX = [[200, -100, 200], [300, 100, 400]]
 BALL = kinds.SimulatedSphereContact("ball", BOX, (10, 0, 60), 30.0, 14, "left", "right", stylus=6.0)
+INNER = kinds.SimulatedSphereContact(
+    "inner", [[300, -200, 100], [600, 200, 700]], (10, 0, 60), 30.0, 14, "left", "right", link=3
+)
 PLATE = kinds.SimulatedPlaneContact("plate", BOX, (20, -40, 30), [[60, 0, 10], [0, 80, 0]], 14, "left", "right")
 
 
@@ -27,13 +30,14 @@ def observed(capture: aj.Capture, arm: aj.Arm) -> tuple[Observed, aj.Parameters]
     return Observed.of(capture, arm), aj.Parameters.independent(arm)
 
 
-@pytest.mark.parametrize("simulated", [BALL, PLATE], ids=["sphere", "plane"])
+@pytest.mark.parametrize("simulated", [BALL, PLATE, INNER], ids=["sphere", "plane", "inner link"])
 def test_exact_contacts_have_no_residual_and_exact_derivatives(simulated):
     capture = aj.simulate(TWO, {}, observations=[simulated], seed=1)
     assert len(capture.sockets) == simulated.poses
     assert {int(q[0, -1]) for q in capture.sockets.values()} == {0}
     (contact,) = capture.observations
-    assert np.all(np.asarray(contact.q)[:, -1] == 1)
+    body = 1 if simulated.link is None else aj.kinematics.chain_of(TWO, "right").body(simulated.link)
+    assert np.all(np.asarray(contact.q)[:, -1] == body)
     seen, space = observed(capture, TWO)
     vector = np.asarray(space.vector())
     geometry = np.asarray(seen.start(space, vector))
@@ -67,6 +71,71 @@ def test_exact_contacts_have_no_residual_and_exact_derivatives(simulated):
             up, down = (unknowns | {name: unknowns[name] + sign * step * unit[:, None]} for sign in (1, -1))
             by_number = (values_at(still, still, up) - values_at(still, still, down)) / (2 * step)
             np.testing.assert_allclose(derivative[k], by_number, rtol=1e-5, atol=1e-4)
+
+
+def on_torso(side: int) -> aj.Arm:
+    """An arm after a torso of two joints, to the left (1) or right (-1) of it."""
+    rows = {kind: np.asarray(getattr(ARM, kind)) for kind in ("alpha", "a", "d", "theta")}
+    torso = {"alpha": (0.3, 0.5 * side), "a": (40.0, 150.0 * side), "d": (200.0, 60.0), "theta": (0.0, 0.0)}
+    joined = {kind: np.concatenate([torso[kind], values]) for kind, values in rows.items()}
+    return aj.Arm(**joined, probe=(20, 0, 80), limits=[[-1, 1]] * 2 + LIMITS)
+
+
+def test_joints_that_carry_both_bodies_are_read_once():
+    names = {side: ["first", "second", *(f"{side} {i}" for i in range(6))] for side in ("left", "right")}
+    torso = aj.kinematics.together({"left": on_torso(1), "right": on_torso(-1)}, joints=names)
+    far = [[-200, -500, 200], [300, 100, 700]]
+    link = kinds.SimulatedSphereContact("link", far, (10, 0, 60), 30.0, 10, "left", "right", link=4)
+    plate = kinds.SimulatedPlaneContact("plate", far, (20, -40, 30), [[60, 0, 10], [0, 80, 0]], 10, "left", "right")
+    noise = aj.Noise(encoder_arcsec=10.0)
+    capture = aj.simulate(torso, {"A": (100, 0, 500)}, poses=6, observations=[link, plate], noise=noise, seed=1)
+    for contact in capture.observations:
+        other = np.concatenate([capture.sockets[name] for name in contact.socket])
+        np.testing.assert_array_equal(np.asarray(contact.q)[:, :2], other[:, :2])
+    seen = Observed.of(capture, torso)
+    contacts = np.arange(len(seen.q)) >= 6
+    assert seen.counted is not None
+    np.testing.assert_array_equal(seen.counted[0], ~contacts)
+    np.testing.assert_array_equal(seen.counted[-1], 1)
+
+    # An error of the torso's readings changes no contact: the place, which is unknown, moves along.
+    space = aj.Parameters.independent(torso)
+    vector = np.asarray(space.vector())
+
+    def residuals(q: np.ndarray) -> np.ndarray:
+        moved = seen.moved(torso, q)
+        rows = rows_at(space, moved, np.concatenate([vector, moved.start(space, vector)])).rows
+        return np.concatenate([np.asarray(part.values).ravel() for part in rows])
+
+    turned = np.array(seen.q)
+    turned[contacts, :2] += 0.01
+    np.testing.assert_allclose(residuals(turned), residuals(np.array(seen.q)), atol=1e-7)
+    # A torso that stood elsewhere in one of the two poses was read twice.
+    apart = aj.Capture(
+        dict(capture.sockets),
+        observations=[
+            capture.observations[0].changed(
+                q=np.asarray(capture.observations[0].q) + 1e-9 * np.eye(len(torso.alpha) + 1)[0]
+            )
+        ],
+    )
+    assert Observed.of(apart, torso).counted is None
+
+
+FAR = INNER.changed(region=np.array(BOX) + 5000.0)
+SIDES = [[60, 0, 10], [0, 80, 0]]
+REFUSED = {
+    "name two chains": lambda: kinds.SimulatedPlaneContact("plate", BOX, (0, 0, 0), SIDES, 3, "left", "left"),
+    "link 7 does not exist; give .* 1 to 6": lambda: aj.simulate(TWO, {}, observations=[INNER.changed(link=7)]),
+    "hardly ever in its region": lambda: aj.simulate(TWO, {}, observations=[FAR]),
+    "give the number of a chain, 0 to 1": lambda: TWO.position([[*np.zeros(TWO.joints), 3.0]]),
+}
+
+
+@pytest.mark.parametrize("says", REFUSED)
+def test_refused_in_one_sentence(says):
+    with pytest.raises(aj.InputError, match=says):
+        REFUSED[says]()
 
 
 def test_a_contact_without_its_other_pose_is_refused():

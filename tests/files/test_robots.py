@@ -229,12 +229,25 @@ stylus = 6.0
 """
 
 
-def test_contacts_of_a_manifest_name_the_sockets_of_the_other_chain(urdf, tmp_path):
+# Joint 6 of the robot is that from the trunk, which the lift carries, to the right arm, whose joints are 7 to 9.
+LINKS = {"": 1, "link = 3\n": 1.008, 'link = "righta"\n': 1.007, 'link = "trunk"\n': 1.006}
+NO_LINKS = {
+    'link = "leftb"\n': "chain 'right_tool' has no moving link 'leftb'; choose one of trunk, righta, rightb",
+    "link = 5\n": "link 5 does not exist; give the number of a link of the chain, 1 to 4",
+}
+
+
+@pytest.mark.parametrize("line", [*LINKS, *NO_LINKS])
+def test_contacts_of_a_manifest_name_the_sockets_of_the_other_chain(urdf, tmp_path, line):
     q = np.random.default_rng(0).uniform(-1, 1, (6, 4))
     rows = [",".join([f"c{i}", *map(str, row)]) for i, row in enumerate(q.tolist())]
     for side in ("left", "right"):
         (tmp_path / f"{side}.csv").write_text("\n".join(["contact,q_1,q_2,q_3,q_4", *rows]))
-    (tmp_path / "m.toml").write_text(CONTACTS)
+    (tmp_path / "m.toml").write_text(CONTACTS + line)
+    if line in NO_LINKS:
+        with pytest.raises(aj.InputError, match=NO_LINKS[line]):
+            aj.files.read_manifest(tmp_path / "m.toml")
+        return
     recording = aj.files.read_manifest(tmp_path / "m.toml")
     aj.files.save_capture(tmp_path / "c.h5", recording)
     capture = aj.files.load_capture(tmp_path / "c.h5").capture
@@ -242,5 +255,5 @@ def test_contacts_of_a_manifest_name_the_sockets_of_the_other_chain(urdf, tmp_pa
     assert contact.kind == "sphere contact"
     assert contact.socket == tuple(f"c{i}" for i in range(6)) == tuple(capture.sockets)
     assert {int(q[0, -1]) for q in capture.sockets.values()} == {0}
-    assert set(np.asarray(contact.q)[:, -1]) == {1.0}
+    assert set(np.asarray(contact.q)[:, -1]) == {LINKS[line]}
     assert contact.radius == 18.0

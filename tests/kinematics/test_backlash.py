@@ -52,6 +52,70 @@ def test_a_joint_yields_to_the_load(nominal):
     np.testing.assert_array_equal(soft.position([0.7, 0.0]), arm.position([0.7, 0.0]))
 
 
+@pytest.mark.parametrize("chains", [(), {"one": (1, 2), "other": (3, 4)}], ids=["arm", "robot"])
+def test_a_load_acts_at_its_centre(chains):
+    """3 kg, 350 mm along the link and 20 mm across it, which is turned by q: its lever is 350 cos q - 20 sin q."""
+    rows = {"alpha": [np.pi / 2, 0.0], "a": [0.0, 300.0], "d": [100.0, 0.0]}
+    rows = {kind: values * (2 if chains else 1) for kind, values in rows.items()}
+    arm = aj.Arm(**rows, probe=(10, 0, 0), load=True, load_centre=(50, 20, 5), chains=chains)
+    soft = with_corrections(arm, ["payload_2", *["payload_4"] * bool(chains)])
+    chain = (1,) if chains else ()
+    for q in (0.4, -1.0):
+        moment = 3 * 9.80665e-3 * 1e-3 * (350 * np.cos(q) - 20 * np.sin(q))  # kN m
+        joints = np.array([0.3, q])
+        at = np.concatenate([np.zeros(2), joints] if chains else [joints])
+        bent = at + np.eye(len(at))[-1] * -0.5 * moment
+        yields = soft.replace(**{f"payload_{len(at)}": 0.5})
+        np.testing.assert_allclose(yields.position([*at, *chain, 3.0]), arm.position([*bent, *chain, 3.0]), atol=1e-9)
+    names = [name for name in aj.kinematics.parameter_names(yields) if not name.startswith("gravity")]
+    by_names = np.asarray(yields.jacobian([*at, *chain, 3.0], names))
+    for name, column in zip(names, by_names.T, strict=True):
+        value = value_of(yields, name)
+        up, down = (yields.replace(**{name: value + step}).position([*at, *chain, 3.0]) for step in (1e-4, -1e-4))
+        np.testing.assert_allclose(column, (np.asarray(up) - np.asarray(down)) / 2e-4, atol=1e-4)
+    if chains:
+        alone = aj.kinematics.chain_of(yields, "other")
+        assert alone.arm.load_centre == (50.0, 20.0, 5.0)
+        np.testing.assert_allclose(alone.arm.position([*joints, 3.0]), yields.position([*at, 1, 3.0]), atol=1e-9)
+
+
+def test_files_keep_the_centre_of_a_load(tmp_path):
+    arm = aj.load_arm("ur10e").replace(load=True, load_centre=(1.0, 2.0, 60.0))
+    aj.files.save_arm(arm, tmp_path / "arm.toml")
+    assert aj.load_arm(tmp_path / "arm.toml").load_centre == arm.load_centre
+    capture = aj.simulate(arm, {"A": (500, 200, 300)}, poses=3, load=[0, 2])
+    aj.files.save_capture(tmp_path / "c.h5", aj.Recording(capture, ArmSpecification(arm)))
+    assert aj.files.load_capture(tmp_path / "c.h5").nominal.arm.load_centre == arm.load_centre
+    with pytest.raises(aj.InputError, match="load_centre"):
+        arm.replace(load_centre=(1.0, 2.0))
+
+
+URDF = (
+    '<robot name="one"><link name="base"/><link name="post"/><link name="upper"/><link name="flange"/>'
+    '<joint name="turn" type="revolute"><parent link="base"/><child link="post"/><axis xyz="0 0 1"/>'
+    '<limit lower="-1" upper="1"/></joint>'
+    '<joint name="lean" type="revolute"><parent link="post"/><child link="upper"/><axis xyz="0 1 0"/>'
+    '<limit lower="-1" upper="1"/></joint><joint name="end" type="fixed"><parent link="upper"/><child link="flange"/>'
+    '<origin xyz="0.3 0 0.1"/></joint></robot>'
+)
+
+
+def test_a_manifest_states_the_centre_of_a_load_from_the_flange(tmp_path):
+    """Of a URDF from its tip link: 2 kg, 50 mm beyond the flange, which is 300 mm from the axis."""
+    (tmp_path / "one.urdf").write_text(URDF)
+    (tmp_path / "a.csv").write_text("q_1 [rad],q_2 [rad],load_kg\n0.0,0.0,2.0\n0.1,0.1,0.0\n")
+    lines = ['arm = "one.urdf"', "probe = [0, 0, 20]", "load_centre = [50, 0, 0]", 'socket = [{ file = "a.csv" }]']
+    (tmp_path / "m.toml").write_text("\n".join(lines))
+    arm = aj.files.read_manifest(tmp_path / "m.toml").nominal.arm
+    soft = with_corrections(arm, ["payload_2"]).replace(payload_2=1.0)
+    ends = np.asarray(soft.position([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0]]))
+    turned = np.linalg.norm(ends[0] - ends[1]) / np.hypot(300, 120)
+    assert turned == pytest.approx(2 * 9.80665 * 0.35 * 1e-3, rel=1e-4)
+    (tmp_path / "a.csv").write_text("q_1 [rad],q_2 [rad]\n0.0,0.0\n0.1,0.1\n")
+    with pytest.raises(aj.InputError, match="load_centre is given, but no table has load_kg"):
+        aj.files.read_manifest(tmp_path / "m.toml")
+
+
 def recorded(nominal, coefficients, seed=1, encoder=72):
     """80 poses of an arm that differs from its drawing; noise of the encoders of 0.02 deg, by default."""
     true = aj.perturbed_arm(aj.Parameters.free_of(nominal), length=0.3, angle=5e-4, seed=seed)

@@ -40,7 +40,7 @@ class StubSession:
         return self.home + 0.3 * np.sin(0.7 * t + np.arange(self.arm.joints))
 
     def __getattr__(self, name: str) -> Any:
-        if name not in ("mark", "temperature", "auto", "place", "finish", "undo", "exclude", "take"):
+        if name not in ("mark", "temperature", "auto", "place", "finish", "undo", "exclude", "take", "skip"):
             raise AttributeError(name)
 
         def do(**fields: Any) -> None:
@@ -67,6 +67,9 @@ class StubSession:
             raise aj.InputError("there is no pose to undo")
         gone = self.poses.pop()
         next(place for place in self.places if place["name"] == gone["place"])["poses"] -= 1
+
+    def _skip(self) -> None:
+        pass
 
     def _exclude(self, pose: int, excluded: bool) -> None:
         self.poses[pose - 1]["excluded"] = excluded

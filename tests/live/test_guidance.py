@@ -1,5 +1,6 @@
 """Guidance: fewer poses than random ones need, outliers named and taken again, what limits U."""
 
+import itertools
 from functools import cache
 from typing import Any
 
@@ -158,4 +159,27 @@ def test_sockets_alone_have_no_scale() -> None:
     found = guide.calibrated(operator.poses[:25])
     assert found is not None
     assert not found.stop
-    assert found.u_length is None or found.u_length > 0.1
+    assert "scale of the nominal arm" in found.limits
+
+
+@pytest.mark.slow
+def test_every_place_is_visited_early_and_places_change_seldom() -> None:
+    places = [pose.place for pose in run()[0].poses]
+    assert set(places[:14]) == set(PLACES)
+    assert sum(a != b for a, b in itertools.pairwise(places)) < len(places) / 3
+
+
+@pytest.mark.slow
+def test_poses_that_were_skipped_are_not_proposed_again() -> None:
+    operator, guide = run()[0], guide_of()
+    wrong = guide.calibrated(operator.poses[:15])
+    for found, place in ((None, None), (wrong, None), (wrong, "B")):
+        skipped: list[NextPose] = []
+        for _ in range(8):
+            asked = guide.next_pose(found, operator.poses[14].q, place, skipped)
+            assert asked is not None
+            near = [pose for pose in skipped if pose.place == asked.place and guide.search.away(pose.q, asked.q) < 0.1]
+            assert near == []
+            skipped.append(asked)
+    assert wrong is not None
+    assert wrong.again is not None

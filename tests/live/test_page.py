@@ -68,6 +68,7 @@ def test_keys_and_clicks_do_what_they_say(shown, width, scheme):
             " ": ("take", {}),
             "x": ("exclude", {"pose": 4, "excluded": True}),
             "u": ("undo", {}),
+            "n": ("skip", {}),
             "a": ("auto", {"on": False}),
         }.items():
             page.keyboard.press(press)

@@ -135,7 +135,8 @@ def test_the_page_is_whole_without_a_token_and_may_load_nothing_else(served):
 
 
 ACTIONS = {
-    "take": {}, "undo": {}, "exclude": {"pose": 1, "excluded": True}, "mark": {"text": "probe remounted, 20 °C"},
+    "take": {}, "undo": {}, "skip": {}, "exclude": {"pose": 1, "excluded": True},
+    "mark": {"text": "probe remounted, 20 °C"},
     "temperature": {"celsius": 21.5}, "auto": {"on": False}, "place": {"name": "B"}, "finish": {"calibrate": False},
 }  # fmt: skip
 

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.live import guidance
 from aacmm_jax.live.devices.device import AbstractDevice
 from aacmm_jax.live.journal import Journal, journal_of
 from tests.live import killed
+from tests.live.unguided import NoGuide
 
 pytestmark = pytest.mark.usefixtures("unguided")
 SETUP = killed.setup()
@@ -44,10 +46,10 @@ class Scripted(AbstractDevice):
             samples.append(aj.live.Sample(self.time, row + 1e-5 * self.random.normal(size=ARM.joints), columns))
         self._give(samples)
 
-    def press(self, q, values):
+    def press(self, q, values, name="button"):
         """Readings with the button pressed or not."""
         self.time += 0.01 * len(values)
-        self._give([aj.live.Sample(self.time, np.asarray(q), {"button": value}) for value in values])
+        self._give([aj.live.Sample(self.time, np.asarray(q), {name: value}) for value in values])
 
     def _give(self, samples):
         self.queue = samples
@@ -76,6 +78,13 @@ def session(tmp_path, device):
         yield session
 
 
+def until(condition):
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
 def numbers(session):
     return [pose["number"] for pose in session.state()["poses"]]
 
@@ -91,10 +100,7 @@ def test_rests_in_places_are_taken_once_and_others_are_not(session, device):
     assert state["sound"] == 2
     np.testing.assert_allclose(state["poses"][0]["tip"], SETUP.place("A").position, atol=0.05)
     json.dumps(state, allow_nan=False)
-    end = time.monotonic() + 20
-    while session.state(session.state()["version"]).keys() != {"version", "sound", "live"}:
-        assert time.monotonic() < end
-        time.sleep(0.02)
+    until(lambda: session.state(session.state()["version"]).keys() == {"version", "sound", "live"})
 
 
 def test_poses_are_taken_by_hand_undone_excluded_and_marked(session, device):
@@ -124,6 +130,29 @@ def test_the_button_takes_a_pose(session, device):
     for pressed, poses in (((0.0, 1.0, 1.0), 1), ((1.0, 0.0), 1), ((0.0, 1.0), 2)):
         device.press(q, pressed)
         assert len(numbers(session)) == poses
+
+
+class Proposing(NoGuide):
+    """Proposes the same readings; the reason counts those that were skipped."""
+
+    def next_pose(self, _, q, place, skipped):
+        return guidance.NextPose("A", np.zeros(ARM.joints), f"{len(skipped)} skipped", 0.0)
+
+
+def test_another_pose_is_proposed_when_asked_for(session, tmp_path, monkeypatch):
+    with pytest.raises(aj.InputError, match="no pose is proposed"):
+        session.skip()
+    device = Scripted()  # a device is read by one session
+    monkeypatch.setattr(guidance, "Guide", Proposing)
+    device = Scripted()
+    with aj.live.Session(SETUP, [device], path=tmp_path / "d.h5") as session:
+        for number in range(3):
+            until(lambda number=number: (session.state()["next"] or {}).get("why") == f"{number} skipped")
+            if number:
+                session.skip()
+            else:
+                device.press(np.zeros(ARM.joints), (0.0, 1.0, 1.0), "skip")
+        assert numbers(session) == []
 
 
 def test_a_place_that_was_said_counts(session, device):

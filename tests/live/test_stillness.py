@@ -60,6 +60,26 @@ def test_every_rest_is_found_soon_and_no_creep_is(tremor: float) -> None:
             np.testing.assert_allclose(rest.q, q, atol=1.5 * tremor * ENCODER)
 
 
+@pytest.mark.parametrize("creep", [4.0, pytest.param(8.0, marks=pytest.mark.slow)])
+def test_a_slow_creep_is_refused_or_does_not_matter(creep: float) -> None:
+    """Drift in 0.3 s, in standard deviations of the tremor; a take states where the arm is within one of these."""
+    tremor = 10.0
+    readings, begins = visits(tremor, creep * tremor * ENCODER / 0.3)
+    for at, rest in rests(readings):
+        following = next(q for begin, q in begins if at < begin + 150)
+        away = rest.q - following
+        assert np.sqrt(np.mean(away**2)) < tremor * ENCODER
+        np.testing.assert_allclose(rest.u, tremor * ENCODER, rtol=0.5)
+
+
+def test_a_thousand_samples_a_second_are_the_same_rests() -> None:
+    readings, begins = visits(10.0, 0.0, poses=2)
+    often = np.repeat(readings, 10, axis=0) + ENCODER * np.random.default_rng(1).normal(size=(10 * len(readings), 6))
+    found = rests(often, 1000.0)
+    assert len(found) == len(begins)
+    assert all(0.1 < at / 1000 - begin / RATE < 1.2 for (at, _), (begin, _) in zip(found, begins, strict=True))
+
+
 def test_a_counter_without_noise() -> None:
     step = 2 * np.pi / 4096
     path = np.concatenate([smooth(100) * np.array([[0.7, -0.4]]), np.tile([0.7, -0.4], (120, 1))])

@@ -3,7 +3,7 @@
 A contact is two poses at one moment. The pose of the chain that touches is that of a socket of its own; the pose of the
 chain that carries the surface is a pose of the contact, which names this socket. The position of the socket is the
 unknown that both have in common, so that a contact is worth one equation. The surface is unknown, in the last frame of
-the chain that carries it, about its tip.
+the chain that carries it, about its tip; or, where the poses are those of an inner link, in the frame of this link.
 """
 
 import abc
@@ -114,12 +114,20 @@ class PlaneContact(AbstractContact, Plane):
 
 
 class AbstractSimulatedContact(AbstractSimulated):
-    """Contacts while the tip that carries the surface is anywhere in a box."""
+    """Contacts while the tip that carries the surface, or the origin of the link, is anywhere in a box."""
 
     region: Float[np.ndarray, "2 3"]
     poses: int
     touching: str
     carrying: str
+    link: int | None = declared(
+        "link that carries it, the number of the joint of the chain before it", default=None, more="None: the last one"
+    )
+
+    def completed(self, where: str) -> Mapping[str, Any]:
+        if self.touching == self.carrying:
+            raise InputError(f"{where} touches and carries with the chain '{self.carrying}'; name two chains.")
+        return super().completed(where)
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         return random.uniform(*np.sort(self.region, axis=0), size=(self.poses, 3))
@@ -151,7 +159,9 @@ class SimulatedSphereContact(AbstractSimulatedContact, AbstractSimulatedRound):
     """
 
     table = "contact_sphere"
-    region: Float[np.ndarray, "2 3"] = declared("box of the tip that carries the sphere, in the base frame", "mm")
+    region: Float[np.ndarray, "2 3"] = declared(
+        "box of the tip that carries the sphere, or of the link's origin, in the base frame", "mm"
+    )
     centre: Float[np.ndarray, "3"] = declared("centre in the frame that carries it, about its tip", "mm")
     diameter: float = declared("true diameter", "mm")
     poses: int = declared("number of contacts")
@@ -178,7 +188,9 @@ class SimulatedPlaneContact(AbstractSimulatedContact):
     """
 
     table = "contact_plane"
-    region: Float[np.ndarray, "2 3"] = declared("box of the tip that carries the plane, in the base frame", "mm")
+    region: Float[np.ndarray, "2 3"] = declared(
+        "box of the tip that carries the plane, or of the link's origin, in the base frame", "mm"
+    )
     corner: Float[np.ndarray, "3"] = declared("corner of the rectangle in the frame that carries it", "mm")
     sides: Float[np.ndarray, "2 3"] = declared("two sides of the rectangle as vectors", "mm")
     poses: int = declared("number of contacts")

@@ -1,7 +1,8 @@
 """A simulated arm with an operator: its own true errors, noise, play, seat offsets, a trembling hand, and mistakes.
 
 ``simulated:?seed=1&speed=10``: the operator takes the tip to the pose that is asked for, holds it still, and goes on;
-with ``habit=1`` near the present pose instead, as people do. Time runs ``speed`` times as fast, in `Sample.time` too.
+with ``habit=1`` near the present pose instead, as people do. Where that pose cannot be reached, it asks for another
+one. Time runs ``speed`` times as fast, in `Sample.time` too.
 """
 
 import time
@@ -186,13 +187,14 @@ class Simulated(AbstractDevice):
         moves += np.outer(np.arange(count) / RATE, np.full(self.joints, self.options["creep"]))
         moves = moves @ self._kept
         measured = {} if self._place is None or self._place.position is not None else self._measured(self._place)
-        self._emit(self._q + moves * bool(not measured), measured)
+        missed = self._place is not None and not self._seated and not measured
+        self._emit(self._q + moves * bool(not measured), measured, missed)
 
-    def _emit(self, path: np.ndarray, measured: Mapping[str, Any]) -> None:
+    def _emit(self, path: np.ndarray, measured: Mapping[str, Any], missed: bool = False) -> None:
         """Samples of a stretch of true configurations."""
         play = 0.5 * self.options["play_arcsec"] * ARCSEC * self._play_side
         shown = path + play + self.encoder * self.random.normal(size=path.shape)
-        columns = {COLUMNS["thermometer"]: self.options["temperature"]}
+        columns = {COLUMNS["thermometer"]: self.options["temperature"], "skip": float(missed)}
         times = self._clock + np.arange(1, len(path) + 1) / RATE
         self._ready += [Sample(float(t), q, columns, measured) for t, q in zip(times, shown, strict=True)]
         self._clock += len(path) / RATE

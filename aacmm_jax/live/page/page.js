@@ -59,6 +59,7 @@ function choose(question, choices, answer) {
 const actions = {
   take: () => ask("take"),
   undo: () => ask("undo"),
+  skip: () => ask("skip"),
   exclude() {
     const pose = state?.poses.find((one) => one.number === chosen) ?? state?.poses.at(-1);
     if (pose) ask("exclude", { pose: pose.number, excluded: !pose.excluded });
@@ -75,7 +76,7 @@ const actions = {
     ["Write and calibrate", () => ask("finish", { calibrate: true })],
     ["Write only", () => ask("finish", { calibrate: false })]]),
 };
-const keys = { " ": "take", u: "undo", x: "exclude", s: "mark", a: "auto", m: "sound", f: "finish" };
+const keys = { " ": "take", u: "undo", x: "exclude", n: "skip", s: "mark", a: "auto", m: "sound", f: "finish" };
 
 for (const [id, act] of Object.entries(actions)) {
   $(id).addEventListener("click", (event) => {
@@ -141,9 +142,10 @@ function live(now) {
   if (!now) return;
   put($("stillness"), now.still ? `Still ${known(now.since) ? now.since.toFixed(1) : ""} s` : "Moving");
   $("now").classList.toggle("still", Boolean(now.still));
-  [...$("joints").querySelectorAll("dd")].forEach((node, i) => {
+  [...$("joints").children].forEach((pair, i) => {
     const unit = { deg: "°" }[state?.arm.joints[i]?.unit] ?? ` ${state?.arm.joints[i]?.unit ?? ""}`;
-    put(node, known(now.q?.[i]) ? `${now.q[i].toFixed(3)}${unit}` : "–");
+    put(pair.children[1], known(now.q?.[i]) ? `${now.q[i].toFixed(3)}${unit}` : "–");
+    put(pair.children[2], known(state?.next?.q?.[i]) ? `next ${state.next.q[i].toFixed(1)}${unit}` : "");
   });
   view.show({ links: now.links ?? [], tip: now.tip ?? null });
   put($("rate"), known(now.rate) ? `${digits(now.rate, 2)} readings a second` : "");
@@ -221,12 +223,13 @@ function everything() {
   if ($("joints").children.length !== arm.joints.length) {
     $("joints").replaceChildren(...arm.joints.map((one) => {
       const pair = element("div");
-      pair.append(element("dt", one.name), element("dd", "–"));
+      pair.append(element("dt", one.name), element("dd", "–"), element("dd", "", "goal"));
       return pair;
     }));
   }
   places();
   poses();
+  $("skip").disabled = !next;
   for (const id of ["sentences", "paths"]) {
     $(id).replaceChildren(...(state[id] ?? []).map((text) => element("li", text)));
   }

@@ -96,7 +96,8 @@ export class View {
     // Some robots' first axis points down; few robots hang from a ceiling.
     if (this.over === null && links.length) this.over = this.low[2] + this.high[2] < 0;
     this.middle = this.low.map((low, i) => (low + this.high[i]) / 2);
-    this.floor = this.over ? Math.max(this.high[2], 0) : Math.min(this.low[2], 0);
+    const heights = places.map((place) => place.position).filter(usable).map((point) => point[2]);
+    this.floor = this.over ? Math.max(0, ...heights) : Math.min(0, ...heights);
     this.extent = Math.max(Math.hypot(...this.low.map((low, i) => this.high[i] - low)) / 2, 1);
   }
 
@@ -123,8 +124,8 @@ export class View {
       this.colours = Object.fromEntries(names.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
     }
     this.#enclose();
-    this.scale = 1.15 * this.zoom * Math.min(this.width, this.height) / 2;
-    this.strokes = [];
+    this.scale = 1.35 * this.zoom * Math.min(this.width, this.height) / 2;
+    [this.strokes, this.labels] = [[], []];
     this.enlarged = this.#enlarged();
     this.#floor();
     this.#marks();
@@ -136,6 +137,7 @@ export class View {
     }
     this.#chain(links, thick, false);
     this.strokes.sort((a, b) => b.depth - a.depth).forEach((stroke) => stroke.paint());
+    this.labels.forEach((paint) => paint());
     this.frames += 1;
     canvas.dataset.frames = this.frames;
   }
@@ -206,12 +208,15 @@ export class View {
       this.strokes.push({ depth: at[2], paint: () => {
         const done = place.wanted && place.poses >= place.wanted, next = place.name === this.scene.next;
         this.#dot(at, 7, done ? colours.good : colours.page, next ? colours.ghost : colours.ink, next ? 4 : 2);
+      } });
+      this.labels.push(() => { // in front of everything
+        const next = place.name === this.scene.next;
         Object.assign(pen, { font: "600 14px system-ui, 'DejaVu Sans', sans-serif", lineWidth: 4,
           strokeStyle: colours.page, fillStyle: next ? colours.ghost : colours.ink });
         const name = place.name.length > 24 ? `${place.name.slice(0, 23)}…` : place.name;
         pen.strokeText(name, at[0] + 12, at[1] - 9);
         pen.fillText(name, at[0] + 12, at[1] - 9);
-      } });
+      });
     }
     const colour = (pose) => (pose.outlier ? colours.bad : pose.excluded ? colours.soft : colours.warm);
     for (const pose of poses) {
@@ -228,9 +233,11 @@ export class View {
   // How much residuals are enlarged, so that the 90 % longest is about a twelfth of the picture.
   #enlarged() {
     const drawn = this.scene.poses.filter((pose) => usable(pose.residual) && !pose.outlier);
-    const lengths = drawn.map((pose) => Math.hypot(...pose.residual)).sort((a, b) => a - b);
+    // Few poses have residuals of almost nothing, which say less than those that are expected.
+    const lengths = drawn.map((pose) => Math.max(Math.hypot(...pose.residual), pose.expected_mm || 0));
+    lengths.sort((a, b) => a - b);
     const large = lengths[Math.floor(0.9 * (lengths.length - 1))];
-    if (!large) return 1;
+    if (!(large > 1e-6 * this.extent)) return 1;
     const wanted = this.extent / 6 / large, power = 10 ** Math.floor(Math.log10(wanted));
     return Math.max(1, [5, 2, 1].find((digit) => digit * power <= wanted) * power);
   }
