@@ -310,7 +310,7 @@ class Session:
     def _read_device(self, device: AbstractDevice) -> None:
         while not self._stop.is_set():
             samples = device.read()
-            raw = b"" if self._stream is None else device.raw()
+            raw = device.raw()
             if not samples and not raw:
                 continue
             with self._lock:

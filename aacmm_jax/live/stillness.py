@@ -126,8 +126,12 @@ class Stillness:
             self._began = self._times[-seconds] if slow_rest else now  # from when on there is only rest
         else:
             since = self.rest.since
-            if drift > _ENDED * self._most_drift and creep > _CREEP:
-                self._end()
+            begins = (
+                drift > _ENDED * self._most_drift if self._known else not self._is_calm(seconds, count, short, floor)
+            )
+            if begins:  # readings that may be of a motion are not averaged
+                if creep > _CREEP:
+                    self._end()
                 return
         if self._times[-count] > self._began:  # nothing of the motion before is in it
             self._seen.append(short.squares)

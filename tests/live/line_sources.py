@@ -1,8 +1,11 @@
 """Arms that send lines to a real pseudo-terminal or socket, with everything that goes wrong on a cable."""
 
+import array
 import contextlib
+import fcntl
 import os
 import socket
+import termios
 import threading
 import time
 import tty
@@ -45,10 +48,19 @@ class Pty:
         os.symlink(os.ttyname(self._slave), self.where)
 
     def send(self, data: bytes) -> None:
-        with contextlib.suppress(BlockingIOError):
-            os.write(self._master, data)
+        until = time.monotonic() + 5
+        while data and time.monotonic() < until:  # a computer that is busy reads late
+            with contextlib.suppress(BlockingIOError):
+                data = data[os.write(self._master, data) :]
+            if data:
+                time.sleep(0.002)
 
     def unplug(self) -> None:
+        # What is not read when a pseudo-terminal is closed is lost with it, and nobody could count it.
+        until, waiting = time.monotonic() + 5, array.array("i", [1])
+        while waiting[0] and time.monotonic() < until:
+            fcntl.ioctl(self._slave, termios.FIONREAD, waiting)
+            time.sleep(0.05)
         os.close(self._slave)
         os.close(self._master)
 
@@ -83,6 +95,26 @@ class Server:
     def close(self) -> None:
         self.unplug()
         self._server.close()
+
+
+class Growing:
+    """A file that a recorder writes, which begins anew where the cable is pulled."""
+
+    kind = "file"
+
+    def __init__(self, folder: Path):
+        self.where = str(folder / "recorder.csv")
+        self.plug()
+
+    def plug(self) -> None:
+        Path(self.where).write_bytes(b"")
+
+    def send(self, data: bytes) -> None:
+        with open(self.where, "ab") as file:
+            file.write(data)
+
+    def close(self) -> None:
+        pass
 
 
 class Feeder(threading.Thread):
@@ -133,7 +165,7 @@ class Feeder(threading.Thread):
         if self.connected() and self.random.uniform() < 0.7:
             self.source.send(checked_line(self.poses[0], self.number + 1)[:17])  # half a line
             self.spoilt["half"] += 1
-        time.sleep(0.3)  # what is not read when a pseudo-terminal is closed is lost with it
+        time.sleep(0.3)
         self.source.unplug()
         until = time.monotonic() + 5
         while self.connected() and time.monotonic() < until:  # nobody counts what is sent before it is noticed

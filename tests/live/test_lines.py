@@ -8,7 +8,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.live.devices.line_format import CHECKSUMS, LONGEST, format_of_lines
-from tests.live.line_sources import Feeder, Pty, Server, columns
+from tests.live.line_sources import Feeder, Growing, Pty, Server, columns
 
 ARM = aj.Arm(alpha=[0, np.pi / 2, 0], a=[0, 300, 300], d=[200, 0, 0], limits=[(-3, 3)] * 3)
 
@@ -65,6 +65,12 @@ def test_checksums_are_those_of_their_standards(name, text, value):
         (b"x" * (LONGEST + 1), {}, f"longer than {LONGEST} characters"),
         (b"nothing", {"pattern": r"(?P<q_1>\d)(?P<q_2>\d)(?P<q_3>\d)"}, "does not match the pattern"),
         (b"\x1b[2J,1,2", {"columns": "q_1,q_2,q_3"}, "not a number"),
+        (b"1\x00,1,2", {}, "not a number"),
+        (
+            b"a" * 4000,
+            {"pattern": r"(?P<q_1>(((a{1,1000}){1,1000}){1,1000}){1,1000})(?P<q_2>b)(?P<q_3>c)"},
+            "takes the pattern too long",
+        ),
     ],
 )
 def test_bad_lines_have_a_reason(line, options, reason):
@@ -157,6 +163,57 @@ def fed(source, tmp_path, count, **options):
         time.sleep(0.3)
         source.close()
         return state(), feeder, session
+
+
+def read_all(device, done, seconds=20.0):
+    samples, until = [], time.monotonic() + seconds
+    while not done() and time.monotonic() < until:
+        samples += device.read()
+    return samples
+
+
+@pytest.mark.parametrize("kind", [pytest.param(Pty, marks=pytest.mark.slow), Server, Growing])
+def test_a_line_of_10_MB_is_one_bad_line_and_takes_no_memory(kind, tmp_path):
+    source, sent = kind(tmp_path), 0
+    device = aj.live.open_device(f"{source.kind}:{source.where}", setup_of(1))
+    read_all(device, lambda: device.connected)
+    read_all(device, lambda: False, 0.15)  # a serial port begins within a line unless it was silent
+    piece, whole = (b"\x1b[2J" * 256, 20_000) if kind is Pty else (b"\x1b[2J" * 10_000, 10_000_000)
+    largest = 0
+    while sent < whole:
+        source.send(piece)
+        sent += len(piece)
+        device.read()
+        device.raw()
+        largest = max(largest, len(device._buffer))
+    source.send(b"\n")
+    read_all(device, lambda: device.lines)
+    source.send(b"1,2,3\n")
+    samples = read_all(device, lambda: device.lines == 2)
+    assert device.bad == {f"longer than {LONGEST} characters": 1}
+    assert len(samples) == 1
+    assert largest <= LONGEST
+    device.close()
+    source.close()
+
+
+def test_a_file_is_followed_where_it_is_cut_or_replaced_and_a_half_line_waits(tmp_path):
+    source, read = Growing(tmp_path), []
+    device = aj.live.open_device(f"file:{source.where}", setup_of(1))
+    for text, lines in ((b"q_1_rad,q_2_rad,q_3_rad\n1,0,", 0), (b"0\n2,0,0\n", 2), (b"3,0", 2)):
+        source.send(text)
+        read += read_all(device, lambda lines=lines: device.lines > lines, 0.3)
+    source.plug()  # cut, with half a line lost
+    read += read_all(device, lambda: not device.connected)
+    source.send(b"4,0,0\n")
+    read += read_all(device, lambda: device.lines == 4)
+    other = tmp_path / "other.csv"
+    other.write_bytes(b"5,0,0\n" * 50)
+    other.replace(source.where)
+    read += read_all(device, lambda: device.lines == 54)
+    assert [sample.q[0] for sample in read] == [1, 2, 4, *[5] * 50]
+    assert device.bad == {"half a line": 1}
+    device.close()
 
 
 @pytest.mark.parametrize("kind", [Pty, Server])

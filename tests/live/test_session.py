@@ -142,6 +142,7 @@ class Proposing(NoGuide):
 def test_another_pose_is_proposed_when_asked_for(session, tmp_path, monkeypatch):
     with pytest.raises(aj.InputError, match="no pose is proposed"):
         session.skip()
+    device = Scripted()  # a device is read by one session
     monkeypatch.setattr(guidance, "Guide", Proposing)
     device = Scripted()
     with aj.live.Session(SETUP, [device], path=tmp_path / "d.h5") as session:

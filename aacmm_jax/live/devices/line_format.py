@@ -1,8 +1,9 @@
 """Lines of text that devices send: how they become readings, described in a TOML or in the text of the device.
 
 ``columns`` names what stands in a line, in order: ``q_1`` ... (joints), ``x``, ``y``, ``z`` (a point), ``distance``,
-``temperature_C``, ``load_kg``, ``button``, ``time_s`` (of the device's clock), ``number`` (that counts the lines), or
-``-``. ``pattern`` is a regular expression with groups of these names instead. By default a line has one number a joint.
+``temperature_C``, ``load_kg``, ``button``, ``skip``, ``time_s`` (of the device's clock), ``number`` (that counts the
+lines), or ``-``. ``pattern`` is a regular expression with groups of these names instead. By default a line has one
+number a joint.
 """
 
 import binascii
@@ -14,20 +15,21 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from ...core.errors import InputError, naming
+from ...core.errors import InputError, naming, require
 from ...core.text import is_number
 from ...core.units import LENGTH_UNITS
 from ...files.manifest_tables import Angles
 from ...files.toml import Strict, read_toml, validated
 from ...kinematics.arm import Arm
-from ..samples import Sample
+from ..samples import BUTTONS, Sample
 
 LONGEST = 4096  # bytes of a line
 _LARGEST = 1e9
 _TURNS = 50 * math.tau  # rad: no joint has turned as far
 _OF_POINTS = ("x", "y", "z")
-_OTHERS = ("temperature_C", "load_kg", "button")
-_KNOWN = re.compile(r"q_\d{1,2}|torque_\d{1,2}|[xyz]|distance|temperature_C|load_kg|button|time_s|number|-")
+_OTHERS = ("temperature_C", "load_kg", *BUTTONS)
+_KNOWN = re.compile(r"q_\d{1,2}|torque_\d{1,2}|[xyz]|distance|temperature_C|load_kg|button|skip|time_s|number|-")
+_PATTERN_TIME = 0.1  # s after which a line is given up that a pattern does not decide
 _SEPARATOR = re.compile(r"[;,\s]+")
 _UNIT = re.compile(r"_(deg|rad|mm|counts)$")
 _MOST_GAP = 1_000_000  # lines that are missing at once, by their numbers
@@ -83,9 +85,12 @@ class LineFormat:
             raise InputError(f"{where} has columns and a pattern; give one of them.")
         self._pattern, names = None, table.columns
         if table.pattern is not None:
+            require("live", "a pattern", "regex")
+            import regex  # of the standard library's patterns, some take for ever
+
             try:
-                self._pattern = re.compile(table.pattern)
-            except re.error as error:
+                self._pattern = regex.compile(table.pattern)
+            except (regex.error, OverflowError, RecursionError) as error:
                 raise InputError(f"{where} has a pattern that is no regular expression: {error}.") from error
             names = sorted(self._pattern.groupindex, key=self._pattern.groupindex.__getitem__)
         self._stated = names is not None
@@ -102,7 +107,7 @@ class LineFormat:
             if not _KNOWN.fullmatch(name):
                 raise InputError(
                     f"{self._where} has the column '{name}'; use q_1, q_2, ..., x, y, z, distance, temperature_C, "
-                    "load_kg, button, time_s, number, or - for what is not used."
+                    "load_kg, button, skip, time_s, number, or - for what is not used."
                 )
         twice = [name for name in names if name != "-" and names.count(name) > 1]
         if twice:
@@ -146,7 +151,10 @@ class LineFormat:
 
     def _read(self, text: str, time: float) -> tuple[Sample | None, str, int]:
         if self._pattern is not None:
-            match = self._pattern.fullmatch(text)
+            try:
+                match = self._pattern.fullmatch(text, timeout=_PATTERN_TIME)
+            except TimeoutError:
+                return None, "takes the pattern too long", 0
             if match is None:
                 return None, "does not match the pattern", 0
             cells = [match[name] or "" for name in self._names]

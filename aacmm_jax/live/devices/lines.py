@@ -74,7 +74,7 @@ class AbstractLines(AbstractDevice):
 
     def _lost(self, error: OSError) -> None:
         self._disconnect()
-        if self._buffer:
+        if self._buffer or self._too_long:
             self._count_bad("half a line")
         self._buffer.clear()
         self.connected, self._too_long = False, False
