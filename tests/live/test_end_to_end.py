@@ -117,7 +117,7 @@ class Running:
         return said
 
 
-SLOWEST = ("SCARA", "SO-101 with a camera")
+SLOWEST = ("SO-101 with a camera",)
 
 
 @pytest.mark.parametrize(
