@@ -39,7 +39,7 @@ def contradicted_prediction(validation: CrossValidation) -> list[Finding]:
     if 0 < count < len(validation.groups) / 2:
         finding = Finding(
             "held-out-group",
-            f"When each group {IN_TURN}, some groups disagree with the others by more than predicted: "
+            "When each group is held out in turn, some groups disagree with the others by more than predicted: "
             f"{named}; the remaining {len(validation.groups) - count} agree.",
             advice=(
                 "Look for what differs in these groups (a socket or tool that moved, a wrong length, poses far "
@@ -60,7 +60,7 @@ def contradicted_prediction(validation: CrossValidation) -> list[Finding]:
             ratios.append(f"{name} {error:.3g} mm RMS, {times}")
     finding = Finding(
         "held-out-all",
-        f"When each placement {IN_TURN}, the errors are larger than predicted: {'; '.join(ratios)}"
+        f"When each placement is held out in turn, the errors are larger than predicted: {'; '.join(ratios)}"
         + (f"; worst in {named}" if named else "")
         + (
             ". The poses agree with their prediction, so a reference length is wrong, or a socket at its ends moved."
