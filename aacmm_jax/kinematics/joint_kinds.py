@@ -23,7 +23,8 @@ def body_of(chain: Any, joint: Any = 0) -> Any:
 
 def _link_of(numbers: Float[AnyArray, "..."]) -> Any:
     """The joint before the link of each number; 0 of tips."""
-    return namespace(numbers).round((numbers - numbers.astype(int)) / _LINK).astype(int)
+    xp = namespace(numbers)
+    return xp.round((numbers - xp.floor(numbers)) / _LINK).astype(int)
 
 
 @jax.tree_util.register_static
@@ -98,8 +99,8 @@ class JointKinds:
         """
         xp, chain = namespace(numbers), numbers.astype(int)
         last = np.concatenate([self._depth[-1:], self._depth[: len(self.prismatic)]])
-        reach = xp.asarray(last)[_link_of(numbers)][..., None]
-        return xp.where(xp.asarray(self._depth) <= reach, xp.asarray(self._of_chain)[chain], 0.0)
+        reach, depth = xp.asarray(last)[_link_of(numbers)][..., None], self._depth.reshape(*(1,) * numbers.ndim, -1)
+        return xp.where(xp.asarray(depth) <= reach, xp.asarray(self._of_chain)[chain], 0.0)
 
     def is_body(self, numbers: Float[np.ndarray, "..."]) -> Bool[np.ndarray, "..."]:
         """Whether each number is that of a chain's tip, or of a link of a chain."""
@@ -142,4 +143,5 @@ def tips_at(geometry: Any, q: Float[AnyArray, "N columns"]) -> Float[AnyArray, "
         return geometry.probe
     number = q[:, geometry.alpha.shape[-1]]
     tips = geometry.probe.reshape(*geometry.probe.shape[:-1], -1, 3)[..., number.astype(int), :]
-    return namespace(tips).where((_link_of(number) == 0)[:, None], tips, 0.0)
+    at_tip = (_link_of(number) == 0).reshape(*(1,) * (tips.ndim - 2), -1, 1)
+    return namespace(tips, q).where(at_tip, tips, 0.0)
