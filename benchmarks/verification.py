@@ -5,14 +5,16 @@ drawing, and what their makers state: the true parameters with errors of a tenth
 another robot of the type, the right ones with wrong signs, or with errors of one to two times that (bad). Poses, with a
 repeatability of 0.03 mm: eight in each of two sockets, with or without a certified distance, or in four; twelve seen by
 a tracker; twelve images of a board by a camera on the arm. True is the RMS error of 400 tips over the workspace by
-either arm, with base frame and tip fitted. Prints the verdicts against the ratio of these errors, the share of 95 %
-intervals of the RMS error that contain that of five times as many such poses, and what recalibrations promise. Where
-the poses of sockets do not decide, a second round follows the advice: the plate in two more places, with as many poses
+either arm, with base frame and tip fitted. Right is "better" or "worse" with the right sign, or "equivalent" where the
+ratio of these errors is within the margin. Prints the verdicts against the ratio, the share of 95 % intervals of the
+RMS error that contain that of five times as many such poses, and what recalibrations promise. Where the poses of
+sockets do not decide, a second round follows the advice: the plate in two more places, with as many poses
 as `verify` says decide it (at least twice, at most six times as many as before), and the verdict by all of them.
 """
 
 import argparse
 import warnings
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,7 @@ import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.kinematics.arm import is_length, joint_limits, parameter_names
 from aacmm_jax.kinematics.parameters import ArmSpecification
+from aacmm_jax.pipeline.verification import MARGIN
 
 kinds = aj.data.observations
 ROBOTS, KINDS = ("ur5e", "ur10e", "fr3", "irb120"), ("sockets", "sockets and length", "two places", "tracker", "board")
@@ -30,7 +33,7 @@ REPEATABILITY, TOOL = 0.03, np.array([15.0, -30.0, 110.0])  # mm
 POSES, SEEN, TESTED = 8, 12, 400
 MOST = 96  # poses of a second round where the first gives no number
 MANY, CHECKED = 5, 20  # times as many poses, whose RMS error is the true one of such poses; deliveries compared so
-CLEAR = 0.7  # the ratio of the true errors of a good delivery and of the nominal arm, at most
+UNDECIDED = "not decided"
 LENS = (620.0, 615.0, 322.0, 241.0, -0.1, 0.05, 0.001, -0.001, 0.02)
 
 
@@ -106,6 +109,14 @@ def true_error(arm: aj.Arm, true: aj.Arm, seed: int = 0) -> float:
     return float(np.sqrt(np.sum(rest**2) / TESTED))
 
 
+def judged(verdict: str, ratio: float) -> str:
+    """Whether a verdict is right, where the ratio of the true errors, delivered over nominal, is this."""
+    if verdict == UNDECIDED:
+        return UNDECIDED
+    true = MARGIN <= ratio <= 1 / MARGIN if verdict == "equivalent" else (verdict == "better") == (ratio < 1)
+    return "right" if true else "wrong"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--deliveries", type=int, default=100)
@@ -113,39 +124,44 @@ def main() -> None:
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     for kind in arguments.kinds:
-        right = wrong = undecided = clear = inside = near = finally_right = finally_wrong = 0
+        counts: dict[str, Counter[str]] = {"first round": Counter(), "after a second": Counter()}
+        clear = inside = 0
         gains, needed = [], []
         for seed in range(arguments.deliveries):
             what = ("good", ("another robot", "wrong signs", "worse")[seed // 2 % 3])[seed % 2]
             robot = "ur10e" if kind == "board" else ROBOTS[seed % len(ROBOTS) if seed % 3 else 0]
             nominal, true, delivered = drawn(seed, robot, what)
             capture, specification = recorded(true, kind, seed), ArmSpecification(nominal, robot)
-            checked = aj.verify(aj.Recording(capture, specification), delivered)
+            checked = last = aj.verify(aj.Recording(capture, specification), delivered)
             errors = true_error(nominal, true), true_error(delivered, true)
-            ratio, expected = errors[1] / errors[0], "better" if errors[1] < errors[0] else "worse"
-            is_clear = ratio < CLEAR or ratio > 1 / CLEAR
-            clear += is_clear
-            right += checked.verdict == expected
-            undecided += checked.verdict == "not decided"
-            near += checked.verdict == "not decided" and not is_clear
-            verdict = checked.verdict
-            if verdict == "not decided" and capture.sockets:
+            ratio = errors[1] / errors[0]
+            if checked.verdict == "not decided" and capture.sockets:
                 both = second_round(capture, checked, true, seed)
-                verdict = aj.verify(aj.Recording(both, specification), delivered).verdict
-            finally_right += verdict == expected
-            finally_wrong += verdict not in (expected, "not decided")
-            if checked.verdict not in (expected, "not decided"):
-                wrong += 1
-                print(f"  wrong: {kind}, seed {seed}, {robot}, {what}, ratio {ratio:.2f}, {checked.share:.2f}")
+                last = aj.verify(aj.Recording(both, specification), delivered)
+            is_clear = ratio < MARGIN or ratio > 1 / MARGIN
+            clear += is_clear
+            for (name, count), found in zip(counts.items(), (checked, last), strict=True):
+                outcome = judged(found.verdict, ratio)
+                count.update(
+                    {outcome, found.verdict, *(["near"] if found.verdict == UNDECIDED and not is_clear else [])}
+                )
+                if outcome == "wrong" or (found is last and outcome == UNDECIDED):
+                    limits = f"{found.ratio_lower:.2f} to {found.ratio_upper:.2f}"
+                    print(f"  {outcome}, {name}: {kind}, seed {seed}, {robot}, {what}, {found.verdict}, ", end="")
+                    print(f"ratio {ratio:.2f} ({limits}), share {found.share:.2f}, {found.poses} poses", flush=True)
             if seed < CHECKED:
                 many = aj.Recording(recorded(true, kind, seed, MANY), specification)
                 inside += checked.delivered.lower <= aj.verify(many, delivered).delivered.rms <= checked.delivered.upper
             gains.append((checked.volume / errors[1], checked.recalibrated))
             if checked.decided_by is not None:
                 needed.append(checked.decided_by)
+        for name, count in counts.items():
+            print(
+                f"{kind:20s} {name}: right {count['right']} ({count['equivalent']} equivalent), "
+                f"wrong {count['wrong']}, "
+                f"not decided {count[UNDECIDED]} ({count['near']} of them with a ratio within the margin)"
+            )
         print(
-            f"{kind:20s} right {right}, not decided {undecided} ({near} of them with a ratio near 1), wrong {wrong}; "
-            f"after a second round right {finally_right}, wrong {finally_wrong}; "
             f"clear {clear}; RMS error inside its interval {inside}; "
             f"expected over true error of the volume {np.percentile([g[0] for g in gains], [5, 50, 95]).round(2)}; "
             f"recalibrated {np.median([g[1] for g in gains]):.3f} mm; "

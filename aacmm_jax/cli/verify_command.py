@@ -37,10 +37,13 @@ def verify(
     """Test the maker's parameters on a few poses.
 
     The command prints the error of the tip as delivered, with U; whether the delivered parameters are better or worse
-    than the nominal ones, or that these poses do not decide it; how many poses do; and what a recalibration would gain.
+    than the nominal ones, or as good, or that these poses do not decide it; how many poses do; and what a recalibration
+    would gain.
     The position of the tool tip, the frames of instruments and the positions of sockets are unknown and are fitted.
 
-    The verdict is a two-sided test at the 5 % level. The exit code is 1 if the delivered parameters are worse.
+    The verdict is a two-sided test at the 5 % level, and "no difference that matters" (errors over the working volume
+    that differ by less than 30 % of the larger) two one-sided tests. The exit code is 1 if the delivered parameters
+    are worse.
     """
     from ..pipeline.verification import verify as run
 

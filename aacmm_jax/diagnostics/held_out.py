@@ -10,6 +10,7 @@ from ..core.text import shorten
 from .findings import Case, Finding
 
 ORDER, NEEDS = 50, "scale"
+IN_TURN = "is held out in turn"  # in every sentence on a cross-validation that disagrees
 _AGREE = 1.1  # times what is predicted, up to which poses agree with their prediction
 
 
@@ -33,8 +34,8 @@ def contradicted_prediction(validation: CrossValidation) -> list[Finding]:
         else:
             error = float(np.sqrt(np.mean(np.square(group.length_error))))
             texts.append(f"{label} (length error {error:.3g} mm RMS, {group.length_ratio:.1f} times its u)")
-    named, doubt = shorten(texts, 3), "errors on held-out data are larger than predicted"
-    concerns = tuple(validation.labels[i] for i in validation.disagreeing)
+    named, concerns = shorten(texts, 3), tuple(validation.labels[i] for i in validation.disagreeing)
+    doubt = "errors of its own poses, held out in turn, are larger than predicted"
     if 0 < count < len(validation.groups) / 2:
         finding = Finding(
             "held-out-group",
@@ -45,6 +46,7 @@ def contradicted_prediction(validation: CrossValidation) -> list[Finding]:
                 "from all others)."
             ),
         )
+        doubt += f" in {count} of {len(validation.groups)} groups ({shorten(list(concerns), 3)})"
         return [finding._replace(severity="doubt", doubt=doubt, concerns=concerns)]
     # Whatever the model of the joints lacks moves the poses too.
     of_lengths = validation.rms_predicted > 0 and validation.rms < _AGREE * validation.rms_predicted

@@ -1,4 +1,5 @@
-"""The pose to take next, of those that are planned: near the present one, with few changes from thing to thing.
+"""The pose to take next, of those that are planned: the one that tells most for the effort of going there, with few
+changes from thing to thing.
 
 At first a few poses are taken in each socket or artefact, since a calibration needs all of them; then more in a row.
 """
@@ -11,7 +12,7 @@ from jaxtyping import Float, Int
 
 from ..kinematics.arm import Arm
 from ..kinematics.workspace import reached
-from ..planning.designs import Candidates
+from ..planning.designs import Candidates, covariance_of
 from ..planning.motion import approaches, move_contacts
 from ..planning.placement import LEAST_POSES
 from .candidates import Search
@@ -21,6 +22,7 @@ from .places import TakenPose
 _HERE = 0.15  # rad, summed over joints: nearer than this a pose is the same
 _FIRST_VISIT, _VISIT = 4, 8  # poses in a row in one thing while others still have too few, and afterwards
 _AWAY = 1e3  # rad that count for a change of place against the order
+_POSE, _LEAST_GAIN = 1.0, 1e-3  # rad that taking a pose counts besides the motion; least gain of one
 _UNPLANNED, _TRIED = 10.0, 30  # rad that count for a candidate that is not planned; how many of these are tried
 _MOVES = 6  # that are checked for collisions
 
@@ -67,8 +69,8 @@ class Proposals:
         return None if self._is_old(pose.place, q, last=False) else self._proposed(pose.place, q, why, False)
 
     def best(self, ahead: Sequence[int], place: str | None) -> NextPose | None:
-        """Of the planned candidates the nearest that the joints can move to without a collision, or of all candidates,
-        where none is left; in ``place``, where that is given."""
+        """Of the planned candidates the one that is worth most for its effort and that the joints can move to without a
+        collision, or of all candidates, where none is left; in ``place``, where that is given."""
         owner, names = self.known.owner, [place.name for place in self.search.setup.places]
         for rows in (np.array([*ahead, *self._in_needy_things()], dtype=int), np.arange(len(self.pool.q))):
             inside = rows if place is None else rows[owner[rows] == names.index(place)]
@@ -93,10 +95,21 @@ class Proposals:
         now = self.now
         if now is None or not len(rows):
             return rows[:_MOVES].tolist()
-        away = self.search.away(self.pool.q[rows], now) + _UNPLANNED * ~np.isin(rows, ahead)
-        first = rows[np.argsort(away + self._change_of_place(self._things[self.known.owner[rows]]))[:_MOVES]]
+        effort = _POSE + self.search.away(self.pool.q[rows], now) + _UNPLANNED * ~np.isin(rows, ahead)
+        effort += self._change_of_place(self._things[self.known.owner[rows]])
+        first = rows[np.argsort(effort / self._gains(rows))[:_MOVES]]
         contacts = move_contacts(self.search.problem.region, np.tile(now, (len(first), 1)), self.pool.q[first])
         return [int(i) for i, _ in sorted(zip(first, contacts, strict=True), key=lambda pair: pair[1] is not None)]
+
+    def _gains(self, rows: Int[np.ndarray, " r"]) -> Float[np.ndarray, " r"]:
+        """By how much each candidate lowers the variances of lengths: the mean difference of their logarithms."""
+
+        def logs(information: np.ndarray) -> np.ndarray:
+            return np.log(self.search.variances(covariance_of(information, self.known.parameters)))
+
+        before = logs(self.known.base)
+        gains = [np.mean(before - logs(self.known.information(self.known.rows[[row]]))) for row in rows]
+        return np.maximum(gains, _LEAST_GAIN)
 
     def _in_needy_things(self) -> list[int]:
         """Some candidates in things that have too few poses, since few may be planned there, which prove impossible."""

@@ -12,6 +12,10 @@ Poses in two sockets are no sample of the working volume. So a verdict needs a s
 volume, by the posterior of a calibration with these poses whose prior is about the *other* arm. It is about the nominal
 arm (b = 0) where the verdict is "better", and about the delivered one (b = 1) where it is "worse": what these poses do
 not show speaks against the verdict.
+
+Where neither is decided, the two may be equivalent: the ratio of their RMS errors over the working volume lies between
+`MARGIN` and 1 / `MARGIN`. That is decided by two one-sided tests at 5 % (Schuirmann 1987, Journal of Pharmacokinetics
+and Biopharmaceutics 15, 657-680), with the posteriors about both arms: of whichever speaks against it more.
 """
 
 import math
@@ -28,7 +32,7 @@ from ..core.distributions import chi_square_quantile, student_quantile, student_
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.numpy_or_jax import to_numpy
 from ..data.recording import Recording
-from ..diagnostics.equations import LEAST_U
+from ..diagnostics.equations import EXACT, LEAST_U
 from ..kinematics.arm import (
     Arm,
     by_joint,
@@ -44,10 +48,13 @@ from ..kinematics.arm import (
 from ..kinematics.parameters import ArmSpecification, Bounds, Parameters
 from ..uncertainty.linearisation import Linearisation
 
-Verdict = Literal["better", "worse", "not decided"]
-LEVEL = 0.05  # of the two-sided test
+VerdictHere = Literal["better", "worse", "not decided"]
+Verdict = Literal["better", "worse", "equivalent", "not decided"]
+LEVEL = 0.05  # of the two-sided test, and of each of the two one-sided tests of equivalence
+MARGIN = 0.7  # of the smaller to the larger RMS error over the working volume: equivalent from here on
 _LENGTHS = 1000.0  # mm; half-width of the box of lengths and of the tip
 _TESTED = 300  # poses that stand for the working volume
+_DRAWS = 4000  # from the posterior
 _SCALES, _NOISES = np.geomspace(0.02, 50, 40), np.geomspace(1e-3, 5, 40)  # of parameters' errors, and of the noise
 _FACTOR = 1.5  # ln 4.5
 _SAME = 1e-9  # of the residuals: the two arms do not differ in these poses
@@ -55,7 +62,6 @@ _MOST = 1000  # poses that may be asked for
 _RANK = 1e-9
 _TURNED = 3e-3  # of the residuals: so far they follow some steps of 1 mrad, and of 1 mm in 1 m
 _FIXED = ("d_1",)  # a solve has at least one parameter; this one does not change
-_EXACT = 1e-6  # mm: smaller residuals are rounding errors
 _FEWEST = 4  # poses
 _LEAST_LEFT = 1e-6  # share of a row that the unknowns leave: what they explain whole shows no error
 
@@ -105,7 +111,9 @@ class Verification(NamedTuple):
         float  # RMS error of the delivered arm over the working volume, as a calibration with these poses has it, mm
     )
     recalibrated: float  # and that of an arm calibrated with these poses, mm
-    verdict_here: Verdict  # for poses such as these
+    ratio_lower: float  # of the delivered to the nominal arm's RMS error over the working volume, 90 % interval
+    ratio_upper: float
+    verdict_here: VerdictHere  # for poses such as these
     same: bool  # whether the two arms do not differ in these poses
 
     @property
@@ -119,9 +127,10 @@ def verify(recording: Recording, delivered: ArmSpecification | Arm | None = None
     """Test the parameters that a maker or controller states on a handful of poses, against the nominal parameters.
 
     The tip of the tool, the frames of instruments and targets, and the positions of sockets are unknown and are
-    eliminated from both arms. The verdict is "better" or "worse" where a two-sided paired test at 5 % says so, else
-    "not decided": of two arms that are equally good, one in forty is called better and one in forty worse. What
-    the poses do not show of the rest of the working volume counts against any verdict.
+    eliminated from both arms. The verdict is "better" or "worse" where a two-sided paired test at 5 % says so: of two
+    arms that are equally good, one in forty is called better and one in forty worse. It is "equivalent" where neither
+    is decided, and two one-sided tests at 5 % show that the smaller RMS error over the working volume is at least 70 %
+    of the larger; else "not decided". What the poses do not show of the working volume counts against any verdict.
 
     Args:
         recording: poses in sockets, on a board, or seen by a tracker; its nominal arm is the one to compare with.
@@ -156,25 +165,29 @@ def verify(recording: Recording, delivered: ArmSpecification | Arm | None = None
     arms = [to_numpy(plain), to_numpy(reading_as(without_corrections(arm), plain.recorded))]
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore", IdentifiabilityWarning)
-        fits = [_fitted(one, recording.capture) for one in arms]
-        sigma = max(math.sqrt(sum(float(fit.sigma) ** 2 for fit in fits) / len(fits)), _EXACT)
-        rows = [_Rows.of(fit.linear, sigma) for fit in fits]
-        unknowns = rows[1].rank
-        equations = len(rows[1].residual)
+        linear, sigmas = zip(*(_fitted(one, recording.capture) for one in arms), strict=True)
+        sigma = max(math.sqrt(np.mean(np.square(sigmas))), EXACT)
+        rows = [_Rows.of(fit, sigma) for fit in linear]
+        unknowns, equations = rows[1].rank, len(rows[1].residual)
         if equations - unknowns < 3 * 2:
             raise InputError(
                 f"{equations} equations for {unknowns} unknowns (tip, frames and positions) test nothing; record at "
                 "least four poses in each of two sockets, or six that an instrument sees."
             )
-        accuracies = [_accuracy(fit.linear, part) for fit, part in zip(fits, rows, strict=True)]
+        accuracies = [_accuracy(fit, part) for fit, part in zip(linear, rows, strict=True)]
         paired = _paired(*rows)
-        linear = [fit.linear for fit in fits]
         # The prior is about the arm that the verdict would be against: few poses cannot decide by it.
         from_nominal, from_delivered = (
             _Volume.of(arms[i], arms[1 - i], linear[i], linear[1 - i], sigma) for i in (0, 1)
         )
+    ratios = np.array([np.quantile(r, (LEVEL, 1 - LEVEL)) for r in (from_nominal.ratio, 1 / from_delivered.ratio)])
+    lower, upper = float(ratios[:, 0].min()), float(ratios[:, 1].max())
     sure = {"better": from_nominal.probability, "worse": from_delivered.probability, "not decided": 0.0}
-    verdict: Verdict = paired.verdict if sure[paired.verdict] > 1 - LEVEL / 2 else "not decided"
+    verdict: Verdict = "not decided"
+    if sure[paired.verdict] > 1 - LEVEL / 2:
+        verdict = paired.verdict
+    elif not paired.same and lower >= MARGIN and upper <= 1 / MARGIN:
+        verdict = "equivalent"
     return Verification(
         verdict=verdict,
         nominal=accuracies[0],
@@ -190,23 +203,21 @@ def verify(recording: Recording, delivered: ArmSpecification | Arm | None = None
         length_errors=np.array([part.relations()[1][: len(recording.capture.lengths)] for part in linear]),
         volume=from_delivered.error,
         recalibrated=from_delivered.left,
+        ratio_lower=lower,
+        ratio_upper=upper,
         verdict_here=paired.verdict,
         same=paired.same,
     )
 
 
-def _fitted(arm: Arm, capture: Any) -> "_Fit":
-    """The unknown geometry, and the tip where it is not a target's, that fit an arm best."""
+def _fitted(arm: Arm, capture: Any) -> tuple[Linearisation, float]:
+    """With the unknown geometry, and the tip where it is not a target's, that fit an arm best; and the standard
+    deviation of a tip coordinate, mm."""
     targeted = not capture.sizes and all(observation.target for observation in capture.observations)
     space = Parameters(arm, _FIXED if targeted else tuple(probe_names(tips_of(arm))))
     bounds = Bounds.around(arm, space, length=0.0 if targeted else _LENGTHS)
     solution = solve(to_numpy(task_of(arm, capture, bounds, Solving(hold=None, replace_noise=False))))
-    return _Fit(solution.linear, solution.state.sigma)
-
-
-class _Fit(NamedTuple):
-    linear: Linearisation
-    sigma: Any  # standard deviation of a tip coordinate, mm
+    return solution.linear, float(solution.state.sigma)
 
 
 class _Rows(NamedTuple):
@@ -265,7 +276,7 @@ def _without(basis: Float[np.ndarray, "R r"], values: Float[np.ndarray, "R ..."]
 def _accuracy(fit: Linearisation, rows: _Rows) -> Accuracy:
     squares = np.concatenate([np.asarray(part) for part in fit.observed.squared_distances(fit.point.rows)])
     equations, freedom = len(rows.residual), len(rows.residual) - rows.rank
-    mean = max(float(squares.mean()), _EXACT**2)
+    mean = max(float(squares.mean()), EXACT**2)
     # Squared distances of single poses scatter more, or less, than those of one normal distribution.
     scatter = float(squares.var(ddof=1)) / len(squares)
     effective = float(np.clip(2 * mean**2 / max(scatter, 1e-300), 1.0, freedom))
@@ -286,7 +297,7 @@ class _Paired(NamedTuple):
     same: bool
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> VerdictHere:
         if self.same or abs(self.share - 0.5) <= self.half_width:
             return "not decided"
         return "better" if self.share > 0.5 else "worse"
@@ -333,6 +344,7 @@ class _Volume(NamedTuple):
     """What these poses say of the errors of an arm over the working volume."""
 
     probability: float  # that more than half of the step to the other arm is real there
+    ratio: Float[np.ndarray, " d"]  # draws of the other arm's RMS error over this one's
     error: float  # expected RMS error of the arm, mm
     left: float  # and that of a calibration with these poses
 
@@ -370,25 +382,21 @@ class _Volume(NamedTuple):
         mean, spread = -(scale**2) * sizes * seen / variance, scale**2 * noise**2 / variance
         limits = np.asarray(joint_limits(arm, None))
         limits = np.where(np.array(by_joint(arm, True, False))[:, None], np.clip(limits, -math.pi, math.pi), limits)
-        q = with_chains(arm, np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_TESTED, arm.joints)))
-        tips, turned = np.asarray(arm.position(q)), np.asarray(arm.pose(q))[:, :3, :3]
-        moved = np.stack([np.cross(axis, tips) for axis in np.eye(3)], axis=2)
-        by_tip = turned  # of a robot, that of each pose's chain
-        if arm.chains:
-            by_tip = np.concatenate(
-                [turned * (q[:, arm.joints] == i)[:, None, None] for i in range(len(arm.chains))], axis=2
-            )
-        free = np.concatenate([moved, np.tile(np.eye(3), (_TESTED, 1, 1)), by_tip], axis=2)
-        frames = _basis(free.reshape(3 * _TESTED, -1))  # of the base, and the tip
+        random = np.random.default_rng(0)
+        q = with_chains(arm, random.uniform(limits[:, 0], limits[:, 1], (_TESTED, arm.joints)))
+        tips, by = np.asarray(arm.position(q)), np.asarray(arm.jacobian(q, (*names, *probe_names(tips_of(arm)))))
+        turned = np.stack([np.cross(axis, tips) for axis in np.eye(3)], axis=2)
+        free = np.concatenate([turned, np.tile(np.eye(3), (_TESTED, 1, 1)), by[:, :, len(names) :]], axis=2)
+        frames, by = _basis(free.reshape(3 * _TESTED, -1)), by[:, :, : len(names)].reshape(3 * _TESTED, -1)
         step = _without(frames, (np.asarray(other.position(q)) - tips).ravel())
-        by_parameters = _without(frames, np.asarray(arm.jacobian(q, names)).reshape(3 * _TESTED, -1)) * steps @ right.T
-        along, gram = step @ by_parameters / max(step @ step, 1e-300), by_parameters.T @ by_parameters / _TESTED
-        remaining = spread @ np.diag(gram)
-        error = np.einsum("stp,pq,stq->st", mean, gram, mean) + remaining
-        deviation = (mean @ along - 0.5) / np.sqrt(np.maximum(spread @ along**2, 1e-300))
-        half = student_tail(deviation, np.full(weight.shape, np.inf)) / 2
-        probability = float(np.sum(weight * np.where(deviation > 0, 1 - half, half)))
-        return cls(probability, math.sqrt(np.sum(weight * error)), math.sqrt(np.sum(weight * remaining)))
+        by_parameters = _without(frames, by) * steps @ right.T
+        remaining = float(np.sum(weight * (spread @ np.sum(by_parameters**2, axis=0))))
+        cells = random.choice(weight.size, _DRAWS, p=weight.ravel())
+        mean, spread = (values.reshape(weight.size, -1)[cells] for values in (mean, spread))
+        errors = (mean + np.sqrt(spread) * random.normal(size=spread.shape)) @ by_parameters.T
+        own, others = np.sum(errors**2, axis=1), np.sum((errors - step) ** 2, axis=1)
+        probability, ratio = float(np.mean(others < own)), np.sqrt(others / np.maximum(own, 1e-300))
+        return cls(probability, ratio, math.sqrt(own.mean() / _TESTED), math.sqrt(remaining / _TESTED))
 
 
 def _with_tip(arm: Arm, fit: Linearisation) -> tuple[Arm, tuple[str, ...]]:

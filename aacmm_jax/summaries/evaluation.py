@@ -50,6 +50,7 @@ def evaluation_summary(
         "kind": "evaluation",
         "arm": record.recording.nominal.name,
         "warnings": list(record.warnings),
+        "calibration_warnings": list(record.calibration_warnings),
         "calibration_unusable": record.calibration_unusable,
     }
     whole = record.evaluations(capture)
@@ -76,8 +77,7 @@ def evaluation_summary(
         summary[key] = [judged.says for judged in decisions if judged.decision == decision]
     tests = record.acceptance() if tests is None else tests
     summary |= _judged(record, tests)
-    summary["verdict"] = evaluation_verdict(summary, len(summary["warnings"]))._asdict()
-    return summary | {"calibration_warnings": list(record.calibration_warnings)}
+    return summary | {"verdict": evaluation_verdict(summary, len(summary["warnings"]))._asdict()}
 
 
 def _grouped(part: Evaluation | None, whole: Evaluation, lengths: list[int]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from ..calibration.agreement import SIGNIFICANCE
 from ..core.text import shorten
 from ..core.units import DEG
 from ..diagnostics.findings import Finding
+from ..diagnostics.held_out import IN_TURN
 from ..uncertainty.coverage import U_AT_LEVEL
 from .result_tables import BEFORE
 from .tables import two_digits
@@ -161,7 +162,8 @@ def evaluation_verdict(summary: Mapping[str, Any], own_warnings: int = 0) -> Ver
         return Verdict("unsure" if incomplete or own_warnings else "good", says)
     if summary.get("held_out") is None:
         return Verdict("neutral", "Measured; no limit was given.")
-    return _as_predicted(summary["held_out"])
+    in_turn = any(IN_TURN in warning for warning in summary.get("calibration_warnings", ()))
+    return _as_predicted(summary["held_out"], in_turn)
 
 
 def _undecided(metric: Mapping[str, Any]) -> str:
@@ -175,8 +177,9 @@ def _undecided(metric: Mapping[str, Any]) -> str:
     )
 
 
-def _as_predicted(held_out: Mapping[str, Any]) -> Verdict:
-    """Of errors on held-out data, which no limit was given for.
+def _as_predicted(held_out: Mapping[str, Any], in_turn: bool) -> Verdict:
+    """Of errors on held-out data, which no limit was given for; ``in_turn``: whether the cross-validation of the
+    calibration found larger errors than predicted.
 
     Lengths that are all within their U raise no doubt, however their errors are distributed within it.
     """
@@ -209,7 +212,9 @@ def _as_predicted(held_out: Mapping[str, Any]) -> Verdict:
         return Verdict("unsure", f"Not confirmed: {says}.", False)
     if larger > _LARGER:
         return Verdict("unsure", f"Errors on held-out data are larger than predicted, but this may be chance: {rms}.")
-    return Verdict(
-        "neutral",
-        f"Errors on held-out data are about as predicted, or smaller: {rms}. No largest permitted error was given.",
+    here = (
+        " This holds for these data: poses of the calibration itself, held out in turn, have larger errors than "
+        "predicted (see its warnings)."
     )
+    says = f"Errors on held-out data are about as predicted, or smaller: {rms}.{here * in_turn}"
+    return Verdict("neutral", f"{says} No largest permitted error was given.")

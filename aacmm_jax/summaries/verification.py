@@ -3,11 +3,11 @@
 from typing import Any
 
 from ..core.text import pluralise
-from ..pipeline.verification import LEVEL, Accuracy, Verification
+from ..pipeline.verification import LEVEL, MARGIN, Accuracy, Verification
 from ..uncertainty.coverage import LEVEL_IN_PERCENT, U_AT_LEVEL
 from .tables import STYLES, Styled, View, listed, plain
 
-_VERDICTS = {"better": "good", "worse": "bad", "not decided": "unsure"}
+_VERDICTS = {"better": "good", "worse": "bad", "equivalent": "neutral", "not decided": "unsure"}
 _LITTLE = 0.1  # of the RMS error: a smaller gain of a recalibration is none
 MEANING = (
     "RMS error: RMS distance of a pose from its socket, point or board position, after the tip of the tool and the "
@@ -33,6 +33,7 @@ def verification_summary(checked: Verification, arm: str, delivered: str) -> dic
         "says": _verdict(checked),
         "accuracy": rows,
         "share": {"value": checked.share, "lower": checked.share_lower, "upper": checked.share_upper},
+        "volume_ratio": {"lower": checked.ratio_lower, "upper": checked.ratio_upper, "margin": MARGIN},
         "probability": checked.probability,
         "poses": checked.poses,
         "equations": checked.equations,
@@ -70,6 +71,11 @@ def _verdict(checked: Verification) -> str:
             f"Not decided: these poses do not show whether the delivered parameters are better than the nominal ones; "
             f"{against}."
         )
+    if checked.verdict == "equivalent":
+        return (
+            "No difference that matters: over the working volume the errors of the delivered and of the nominal "
+            f"parameters differ by less than {1 - MARGIN:.0%} of the larger; {against}."
+        )
     comparison = "better than" if checked.verdict == "better" else "worse than"
     return f"The delivered parameters are {comparison} the nominal ones: {against}."
 
@@ -79,6 +85,12 @@ def _poses(checked: Verification) -> str:
     errors = f"(of two equally good sets, {50 * LEVEL:g} % are called better and {50 * LEVEL:g} % worse)"
     if checked.same:
         return ""
+    if checked.verdict == "equivalent":
+        here = checked.verdict_here
+        return ("" if here == "not decided" else f"In poses such as these they are {here}. ") + (
+            f"Of two sets that differ by {1 - MARGIN:.0%}, at most {LEVEL:.0%} are called equivalent. More poses could "
+            "tell which of the two is a little better."
+        )
     if checked.verdict != "not decided":
         assert checked.decided_by is not None
         enough = min(checked.decided_by, checked.poses)
@@ -89,14 +101,17 @@ def _poses(checked: Verification) -> str:
             "the rest of the working volume. Record poses in other places, far apart."
         )
     if checked.decided_by is None:
-        return "At this real share, not even a thousand poses would decide: the two sets are equally good."
+        return "At this real share, not even a thousand poses would decide which is better."
     more = max(checked.decided_by - checked.poses, 1)
     return f"If the real share stays as it is, about {pluralise(more, 'more pose')} would decide {errors}."
 
 
 def _gain(checked: Verification) -> str:
     """What a recalibration gains."""
-    volume = f"Over the working volume, the delivered parameters are expected to err by {checked.volume:.2g} mm RMS"
+    volume = (
+        f"Over the working volume, the delivered parameters are expected to err by {checked.volume:.2g} mm RMS, "
+        f"{checked.ratio_lower:.2g} to {checked.ratio_upper:.2g} times as much as the nominal ones (90 %)"
+    )
     left = f"a calibration with these poses by {checked.recalibrated:.2g} mm"
     if checked.gain > _LITTLE * checked.volume:
         return f"{volume}, and {left}: it would gain {checked.gain:.2g} mm."

@@ -3,6 +3,7 @@
 import pytest
 
 from aacmm_jax.diagnostics import Finding
+from aacmm_jax.diagnostics.held_out import IN_TURN
 from aacmm_jax.summaries.tables import decimals_for, lengths_sentence, rms_difference, two_digits
 from aacmm_jax.summaries.verdicts import (
     calibration_verdict,
@@ -183,6 +184,14 @@ def test_of_an_evaluation(summary, own, mark, says):
     verdict = evaluation_verdict(summary, own)
     assert verdict.mark == mark
     assert says in verdict.says
+
+
+def test_held_out_data_that_agree_do_not_hide_that_the_cross_validation_does_not():
+    groups = [f"When each group {IN_TURN}, some groups disagree with the others by more than predicted: A."]
+    summary = evaluated(held_out=held_out(0.9, 0.2))
+    alone, beside = evaluation_verdict(summary), evaluation_verdict(summary | {"calibration_warnings": groups})
+    assert "held out in turn" not in alone.says
+    assert "poses of the calibration itself, held out in turn, have larger errors than predicted" in beside.says
 
 
 @pytest.mark.parametrize(
