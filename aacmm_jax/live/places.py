@@ -135,7 +135,7 @@ def setup_of(
         planned: Name of the place and readings, rad, or mm of prismatic joints, of each pose of a plan.
 
     Raises:
-        InputError: The kit is empty.
+        InputError: The kit is empty, or the arm is a robot of several chains.
 
     Example:
         >>> bar = aj.data.observations.SimulatedArtefact("bar", {"1": (400, 0, 200), "2": (700, 0, 200)}, 5, u=0.001)
@@ -144,6 +144,12 @@ def setup_of(
         >>> print([place.name for place in setup.places])
         ['bar/1', 'bar/2']
     """
+    if specification.arm.chains:
+        chains = ", ".join(name for name, _ in specification.arm.chains)
+        raise InputError(
+            f"a live capture is of one chain, but this robot has {len(specification.arm.chains)} ({chains}); name the "
+            "tip of one (--tip), and capture each on its own."
+        )
     places: list[Place] = []
     for given in kit:
         item = given if isinstance(given, KitItem) else KitItem(given, places=0)

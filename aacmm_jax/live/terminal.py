@@ -3,6 +3,7 @@
 import contextlib
 import os
 import queue
+import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -152,9 +153,14 @@ def _unbuffered() -> Iterator[Callable[[], str]]:
     import tty
 
     number = sys.stdin.fileno()
-    before = termios.tcgetattr(number)
+    before, ended = termios.tcgetattr(number), signal.getsignal(signal.SIGTERM)
+    is_main = threading.current_thread() is threading.main_thread()
     try:
+        if is_main:  # by default a process that is ended leaves the terminal without echo
+            signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
         tty.setcbreak(number)
         yield lambda: os.read(number, 1).decode("latin-1")
     finally:
         termios.tcsetattr(number, termios.TCSADRAIN, before)
+        if is_main:
+            signal.signal(signal.SIGTERM, ended)

@@ -116,6 +116,13 @@ def test_instruments_and_sessions_make_a_capture(tmp_path):
         aj.live.capture_of(setup, [poses[1]._replace(measured={})])
 
 
+def test_a_robot_of_several_chains_is_captured_chain_by_chain():
+    arm = aj.load_arm("cheng2018-simulation")
+    robot = aj.kinematics.together({"left": arm, "right": arm})
+    with pytest.raises(aj.InputError, match=r"of one chain, but this robot has 2 \(left, right\); name the tip"):
+        aj.live.setup_of(aj.kinematics.ArmSpecification(robot, "two"), aj.files.load_noise("cheng2018-simulation"), [])
+
+
 @pytest.mark.slow
 def test_the_command_in_a_terminal(tmp_path):
     (tmp_path / "kit.toml").write_text(KIT.replace("places = 2\n", "").partition("[[points]]")[0])
