@@ -159,6 +159,7 @@ class _Search:
             if best.cause.kind != "pose" and sum(r.cause.kind != "pose" for r, _ in self.chosen) >= MOST_CAUSES:
                 break
             alike = [other for other in others if other.criterion > best.criterion - _AS_WELL]
+            best, alike = _likelier_first(best, alike)
             self.chosen.append((best, alike))
             added = 1 if best.test is None else best.test.degrees_of_freedom[0]
             shares.append((remaining * best.share, added))
@@ -361,3 +362,13 @@ class _Search:
             culprit = Culprit(cause.kind, cause.name, result.probability, part)
             culprits.append(in_words(self.case, culprit, result, alike, coefficients.get(id(result), np.zeros(0))))
         return tuple(culprits)
+
+
+def _likelier_first(best: Result, alike: list[Result]) -> tuple[Result, list[Result]]:
+    """What explains most, with what explains as much; the cause that is likelier by its nature first."""
+    term = best.cause.term
+    for other in alike:
+        found = other.cause.term
+        if term is not None and found is not None and (found.kind, found.joint) == (term.rather, term.joint):
+            return other, [best, *(rest for rest in alike if rest is not other)]
+    return best, alike

@@ -47,6 +47,7 @@ class MissingTerm(NamedTuple):
     column: int | None = None  # of `Rows.extra`, where that is not the joint's
     first: int = -1  # pose from which on it applies, of a step
     correction: tuple[str, str] | None = None  # model and option of the joint correction that describes it
+    rather: str = ""  # kind of the joint's term that is taken instead where it explains as much
 
     @property
     def source(self) -> int | None:
@@ -85,8 +86,9 @@ def wider_model(terms: Sequence[FoundTerm], arm: Arm | None) -> str:
             continue
         kind, default = sought[term.kind]
         # All of its default functions where the model has none yet, as a first harmonic is seldom alone.
-        option = default.option if any(other.kind.model == kind.model for other in present) else ""
-        added += kind.terms(joints, option, None)
+        alone, usual = kind.terms(joints, default.option, None), kind.terms(joints, "", None)
+        in_usual = {*alone} <= {*usual} and not any(other.kind.model == kind.model for other in present)
+        added += usual if in_usual else alone
     wider = model_of([*present, *added]) if added else ""
     return "" if present and wider == model_of(present) else wider
 
@@ -132,9 +134,9 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
         of_joints += [_settling(term) for term in drifts] if settles else drifts
     of_joints += [named("zero", joint, np.ones_like(order), relative=True) for joint in range(1, arm.joints + 1)]
     for name, (kind, sought) in all_sought().items():
-        if kind.column and kind.column not in arm.beside.names(q.shape[1]):
-            continue
         terms = terms_of(model_with(kind, sought.option), arm.joints)
+        if not {kind.column_of(term) for term in terms} - {""} <= {*arm.beside.names(q.shape[1])}:
+            continue
         values = function_values(arm, terms, q)
         if kind.of_arm:
             growth = [row for row, term in zip(values, terms, strict=True) if not term.joint and np.ptp(row) > 0]
@@ -143,7 +145,9 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
             # A scale has no revolution to repeat, and carries what it moves.
             if joint not in arm.prismatic or sought.of_slides:
                 of_joint = values[[term.joint == joint for term in terms]].T
-                of_joints.append(named(name, joint, of_joint, sought.relative))
+                of_joints.append(named(name, joint, of_joint, sought.relative)._replace(rather=sought.rather))
+                if kind.rows == 3 and of_joint.shape[1] > 1:  # of equal weights: one coefficient, as their side has
+                    of_joints.append(named(name, joint, of_joint.sum(axis=1, keepdims=True)))
     return [*of_joints, *of_tip]
 
 

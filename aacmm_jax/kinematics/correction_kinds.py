@@ -47,6 +47,7 @@ class Sought(NamedTuple):
     cause: str  # what usually causes it, with its article: "an eccentric encoder"
     of_slides: bool = False  # whether prismatic joints have it as well
     relative: bool = False  # whether its size is the coefficient, a ratio, rather than what it adds over the poses
+    rather: str = ""  # name of what is taken for the cause where that explains as much
 
 
 @dataclass(frozen=True)

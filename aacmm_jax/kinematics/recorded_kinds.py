@@ -46,7 +46,12 @@ class Backlash(AbstractCorrection):
     usual_of_slide = 0.05
     column = "directions"
     has_options = True
-    sought = (Sought("backlash", "", "the direction of approach of joint {i}", "backlash", of_slides=True),)
+    sought = (
+        Sought("backlash", "", "the direction of approach of joint {i}", "backlash", of_slides=True),
+        Sought(
+            "backlash by gravity", "gravity", "the side to which gravity turns joint {i}", "backlash", rather="gravity"
+        ),
+    )
 
     def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
         if option not in ("", "gravity"):

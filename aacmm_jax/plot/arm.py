@@ -8,8 +8,9 @@ from jaxtyping import Float
 
 from ..core.arrays import Numbers
 from ..core.errors import InputError
-from ..kinematics.arm import Arm, checked_readings, joint_limits, without_corrections
+from ..kinematics.arm import Arm, checked_readings, joint_limits, with_chains, without_corrections
 from ..kinematics.axes_to_dh import dh_frames, geometry_of
+from ..kinematics.robots import chains_of
 from ..kinematics.workspace import arm_reach, skeleton
 from .charts import Marks, Plot, linear
 from .figures import TONES, draw, new_figure, save_figure
@@ -44,7 +45,7 @@ def arm_poses(arm: Arm, q: Numbers, axes: Any = None) -> Any:
 
 
 def arm_at_zero(arm: Arm, axes: Any = None, *, base: Float[np.ndarray, "4 4"] | None = None) -> Any:
-    """Plot an arm at readings of zero, with the axis of each joint as a numbered arrow, mm.
+    """Plot an arm, or all chains of a robot, at readings of zero, with the axis of each joint as a numbered arrow, mm.
 
     Args:
         arm: The arm.
@@ -56,17 +57,24 @@ def arm_at_zero(arm: Arm, axes: Any = None, *, base: Float[np.ndarray, "4 4"] | 
     """
     axes = _axes_in_space(axes)
     base = np.eye(4) if base is None else base
-    line = skeleton(arm, np.zeros((1, arm.joints)))[0] @ base[:3, :3].T + base[:3, 3]
-    axes.plot(*line.T, color=_DARK, linewidth=3, marker="o", markersize=3)
-    axes.plot(*line[-1:].T, linestyle="none", marker="+", color=_ACCENT, markersize=10)
-    size = 0.12 * max(np.ptp(line, axis=0).max(), 1e-9)
-    for number, frame in enumerate(dh_frames(geometry_of(without_corrections(arm)), base)[:-1], start=1):
-        origin, end = frame[:3, 3], frame[:3, 3] + size * frame[:3, 2]
-        axes.quiver(*origin, *(end - origin), color=_ACCENT, linewidth=1.2, arrow_length_ratio=0.25)
-        axes.text(*(end + 0.4 * size * frame[:3, 2]), f"  {number}", color=_ACCENT, fontsize=9, va="center")
+    plain = without_corrections(arm)
+    chains = [(chain.arm, base @ chain.base, chain.joints) for chain in chains_of(plain).values()]
+    chains = chains or [(plain, base, tuple(range(1, arm.joints + 1)))]
+    lines = [skeleton(one, np.zeros((1, one.joints)))[0] @ on[:3, :3].T + on[:3, 3] for one, on, _ in chains]
+    points = np.concatenate(lines)
+    size, drawn = 0.12 * max(np.ptp(points, axis=0).max(), 1e-9), set[int]()
+    for line, (one, on, numbers) in zip(lines, chains, strict=True):
+        axes.plot(*line.T, color=_DARK, linewidth=3, marker="o", markersize=3)
+        axes.plot(*line[-1:].T, linestyle="none", marker="+", color=_ACCENT, markersize=10)
+        frames = zip(numbers, dh_frames(geometry_of(one), on)[:-1], strict=True)
+        for number, frame in (pair for pair in frames if pair[0] not in drawn):
+            origin, end = frame[:3, 3], frame[:3, 3] + size * frame[:3, 2]
+            axes.quiver(*origin, *(end - origin), color=_ACCENT, linewidth=1.2, arrow_length_ratio=0.25)
+            axes.text(*(end + 0.4 * size * frame[:3, 2]), f"  {number}", color=_ACCENT, fontsize=9, va="center")
+        drawn |= set(numbers)
     # A flat arm in a box of its own size would be a line.
-    low, high = line.min(axis=0), line.max(axis=0)
-    half = 0.6 * np.maximum(high - low, 0.6 * np.ptp(line, axis=0).max())[:, None] * [-1, 1]
+    low, high = points.min(axis=0), points.max(axis=0)
+    half = 0.6 * np.maximum(high - low, 0.6 * np.ptp(points, axis=0).max())[:, None] * [-1, 1]
     ends = ((low + high) / 2)[:, None] + half
     axes.set(xlim=ends[0], ylim=ends[1], zlim=ends[2])
     _label_space(axes)
@@ -84,7 +92,7 @@ def arm_workspace(arm: Arm, axes: Any = None) -> Any:
         >>> aj.plot.arm_workspace(arm).figure.savefig("figure.svg")
     """
     limits = np.asarray(joint_limits(arm, None))
-    q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_TIPS, arm.joints))
+    q = with_chains(arm, np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_TIPS, arm.joints)))
     tips, reach = np.asarray(arm.position(q)), arm_reach(arm)
     radius, shoulder = np.hypot(tips[:, 0], tips[:, 1]), float(reach.shoulder[2])
     angles = np.linspace(-np.pi / 2, np.pi / 2, 181)

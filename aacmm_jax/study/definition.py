@@ -16,7 +16,7 @@ from ..core.units import ARCSEC, DEG, M
 from ..data.capture import Capture
 from ..data.recording import Recording
 from ..files.arms import specification_toml
-from ..kinematics.arm import Arm, correction_names, joint_limits, one_chain, without_corrections
+from ..kinematics.arm import Arm, correction_names, joint_limits, without_corrections
 from ..kinematics.parameters import ArmSpecification, Parameters, single
 from ..kinematics.priors import Prior
 from ..model.observed import Observed
@@ -95,7 +95,11 @@ class Study:
     """
 
     def __init__(self, specification: Specification, nominal: ArmSpecification, recording: Recording | None = None):
-        one_chain(single(nominal.arm), "a study")
+        if single(nominal.arm).chains and recording is None:
+            raise InputError(
+                "a study of a robot with several chains needs the poses of a capture; simulate one (aacmm simulate), "
+                "and name its file in [capture]."
+            )
         self.specification, self.nominal, self.recording = specification, _picklable(nominal), recording
         if recording is not None:
             true = None if recording.true is None else _picklable(recording.true)
@@ -119,8 +123,8 @@ class Study:
 
     @property
     def observed(self) -> bool:
-        """Whether the capture has observations besides sockets and lengths."""
-        return self.capture is not None and bool(self.capture.observations)
+        """Whether the capture has observations besides sockets and lengths, or is of a robot, and so solved at once."""
+        return self.capture is not None and bool(self.capture.observations or self.nominal.arm.chains)
 
     @property
     def trials(self) -> int:
@@ -245,13 +249,13 @@ class Study:
         """Observations besides sockets are solved at once: jointly, or as stage 1 where nothing fixes the scale."""
         capture, prior = self.capture, self.identified(setting)[1]
         scaled = self.specification.reference is not None if capture is None else bool(capture.lengths)
-        if capture is not None and capture.observations:
+        if capture is not None and self.observed:
             scaled = scaled or any(observation.fixes_scale for observation in capture.observations)
             possible = "joint" if scaled else "stage1"
             if asked not in (None, possible):
                 raise InputError(
-                    f"identification.method is '{asked}', but captures with observations other than sockets are "
-                    "solved in one step, "
+                    f"identification.method is '{asked}', but captures of robots, and those with observations other "
+                    "than sockets, are solved in one step, "
                     f"{'because they fix the scale' if scaled else 'and these observations do not fix the scale'}; "
                     f"use '{possible}'."
                 )

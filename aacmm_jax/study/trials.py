@@ -173,7 +173,12 @@ def _recorded(study: Study) -> _Recorded:
     truth = ObservedTruth.at(study.capture, space, space.vector(), observed.split(geometry))
     units = reading_units(space.base.geometry)
     by_units = [np.moveaxis(np.asarray(part.by_readings) * units[:, None], -1, 0) for part in truth.parts]
-    return _Recorded(truth, space, [np.linalg.pinv(matrix, rcond=1e-6) for matrix in by_units], geometry)
+    inverses = [np.linalg.pinv(matrix, rcond=1e-6) for matrix in by_units]
+    if (counted := truth.observed.counted) is not None:  # not by rounding either
+        inverses = [
+            matrix * counted[:, part.poses].T[..., None] for matrix, part in zip(inverses, truth.parts, strict=True)
+        ]
+    return _Recorded(truth, space, inverses, geometry)
 
 
 def _draw_observed(
@@ -194,7 +199,7 @@ def _draw_observed(
         at_random = setting.random_start & ~fixed
         start.append(np.where(at_random, lower + fraction * (upper - lower), nominal))
         taken, left = _taken(recorded, true[-1])
-        q.append(_read(recorded.space.base, taken, truth.reading, values, random))
+        q.append(_read(recorded.space.base, taken, truth, values, random))
         errors = truth.errors_of_rows(1, float(values.seating), random)
         shifts.append([error[0] - rows for error, rows in zip(errors, left, strict=True)])
         certified.append({name: drawn[0] for name, drawn in truth.values(1, random).items()})
@@ -227,7 +232,7 @@ def _taken(
             break
         for rows, inverse, values in zip(observed.slices, recorded.inverses, left, strict=True):
             step = np.einsum("mnr,rm->mn", inverse, values)
-            q[rows] -= units * np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
+            q[rows, : len(units)] -= units * np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
         # Poses that were read at once are still one configuration: their mean.
         sums = np.stack([np.bincount(reading, weights=column) for column in q.T], axis=1)
         q = (sums / counts[:, None])[reading] if len(counts) < len(reading) else q
@@ -236,14 +241,16 @@ def _taken(
 
 def _read(
     arm: Arm,
-    q: Float[np.ndarray, "M n"],
-    reading: Int[np.ndarray, " M"],
+    q: Float[np.ndarray, "M columns"],
+    truth: ObservedTruth,
     values: CellValues,
     random: np.random.Generator,
-) -> Float[np.ndarray, "M n"]:
-    """What the encoders show: eccentricity (a first harmonic of the angle), noise and rounding."""
+) -> Float[np.ndarray, "M columns"]:
+    """What the encoders show: eccentricity (a first harmonic of the angle), noise and rounding. What is recorded beside
+    the joints is exact."""
+    reading, exact = truth.reading, np.zeros(q.shape[1] - arm.joints)
     eccentricity, encoder, step = (
-        np.array(by_joint(arm, *map(float, pair)))
+        np.append(by_joint(arm, *map(float, pair)), exact)
         for pair in (
             (values.eccentricity, 0.0),
             (values.encoder, values.linear_encoder),
@@ -252,5 +259,8 @@ def _read(
     )
     harmonics = eccentricity * random.normal(size=(2, q.shape[1]))
     q = q + harmonics[0] * np.sin(q) + harmonics[1] * np.cos(q)
-    q = q + encoder * random.normal(size=(reading.max() + 1, q.shape[1]))[reading]
+    noise = encoder * random.normal(size=(reading.max() + 1, q.shape[1]))[reading]
+    if truth.observed.counted is not None:
+        noise[:, : arm.joints] *= truth.observed.counted.T
+    q = q + noise
     return np.where(step > 0, np.round(q / np.where(step > 0, step, 1.0)) * step, q)

@@ -81,12 +81,15 @@ def on_torso(side: int) -> aj.Arm:
     return aj.Arm(**joined, probe=(20, 0, 80), limits=[[-1, 1]] * 2 + LIMITS)
 
 
+NAMES = {side: ["first", "second", *(f"{side} {i}" for i in range(6))] for side in ("left", "right")}
+TORSO = aj.kinematics.together({"left": on_torso(1), "right": on_torso(-1)}, joints=NAMES)
+BESIDE = [[-200, -500, 200], [300, 100, 700]]
+TORSO_LINK = kinds.SimulatedSphereContact("link", BESIDE, (10, 0, 60), 30.0, 10, "left", "right", link=4)
+
+
 def test_joints_that_carry_both_bodies_are_read_once():
-    names = {side: ["first", "second", *(f"{side} {i}" for i in range(6))] for side in ("left", "right")}
-    torso = aj.kinematics.together({"left": on_torso(1), "right": on_torso(-1)}, joints=names)
-    far = [[-200, -500, 200], [300, 100, 700]]
-    link = kinds.SimulatedSphereContact("link", far, (10, 0, 60), 30.0, 10, "left", "right", link=4)
-    plate = kinds.SimulatedPlaneContact("plate", far, (20, -40, 30), [[60, 0, 10], [0, 80, 0]], 10, "left", "right")
+    torso, link = TORSO, TORSO_LINK
+    plate = kinds.SimulatedPlaneContact("plate", BESIDE, (20, -40, 30), [[60, 0, 10], [0, 80, 0]], 10, "left", "right")
     noise = aj.Noise(encoder_arcsec=10.0)
     capture = aj.simulate(torso, {"A": (100, 0, 500)}, poses=6, observations=[link, plate], noise=noise, seed=1)
     for contact in capture.observations:
