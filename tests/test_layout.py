@@ -233,7 +233,7 @@ def test_every_import_of_another_package_is_declared():
         "rosbags",  # the extra ros
         *("backports", "compression"),  # comes with rosbags; of Python 3.14
         "pyarrow",  # the extra lerobot
-        *("starlette", "uvicorn", "serial"),  # the extra live
+        *("starlette", "uvicorn", "serial", "regex"),  # the extra live
         "yaml",  # PyYAML
         *(each.split(">=")[0] for each in DEPENDENCIES),
     }

@@ -9,6 +9,7 @@ from pydantic import Field, FiniteFloat, NonNegativeInt, PositiveFloat, Positive
 
 from ..core.errors import InputError, naming
 from ..core.units import DEG
+from ..data.capture_data import ReferenceLength
 from ..data.observations.declared import FREE
 from ..data.observations.simulated import AbstractSimulated, simulated_kinds
 from ..data.observations.simulated_pixels import SimulatedPixels
@@ -18,6 +19,7 @@ from .inputs import InputFile
 from .manifest_cameras import CameraTable, TargetTable
 from .manifest_pixels import Cameras
 from .manifest_rows import Source
+from .manifest_tables import Length
 from .toml import Point, Strict, read_toml
 
 _POSES = 20  # where none is stated
@@ -69,16 +71,17 @@ _FIELDS: dict[str, Any] = {
 }
 
 
-class _OfCameras(Strict):
+class _Beside(Strict):
+    length: list[Length] = Field(default_factory=list)
     camera: list[CameraTable] = Field(default_factory=list)
     target: list[TargetTable] = Field(default_factory=list)
     pixels: list[KitPixels] = Field(default_factory=list)
 
 
-_Kit = create_model("_Kit", __base__=_OfCameras, **_FIELDS)
+_Kit = create_model("_Kit", __base__=_Beside, **_FIELDS)
 
 
-def read_kit(path: str | os.PathLike) -> list[KitItem]:
+def read_kit(path: str | os.PathLike, *, lengths: bool = False) -> list[KitItem]:
     """Read a kit: what is at hand for a calibration, with its uncertainties, for `planning.plan_kit`.
 
     Tables are ``[[artefact]]``, ``[[touched_sphere]]``, ``[[touched_cylinder]]``, ``[[planes]]`` (one, or two at a
@@ -92,8 +95,11 @@ def read_kit(path: str | os.PathLike) -> list[KitItem]:
     ``[[pixels]]`` is a camera that sees a target, which have the tables ``[[camera]]`` and ``[[target]]`` of a manifest
     and stand where it says.
 
+    ``[[length]]``, as in a manifest, is a certified length between two sockets; `kit_lengths` reads it.
+
     Args:
         path: The TOML file.
+        lengths: Whether ``[[length]]`` may be there, which plans and simulations of kits do not use.
 
     Example:
         >>> from pathlib import Path
@@ -103,6 +109,11 @@ def read_kit(path: str | os.PathLike) -> list[KitItem]:
         [('cone', 3)]
     """
     content = read_toml(path, _Kit)
+    if content.length and not lengths:
+        raise InputError(
+            f"{path} has [[length]], which only a live capture uses; state an artefact with two points instead, or "
+            "leave it out."
+        )
     items: list[KitItem] = []
     for table, kind in _KINDS.items():
         for entry in getattr(content, table):
@@ -154,6 +165,20 @@ def _pixels(entry: KitPixels, cameras: Cameras) -> SimulatedPixels:
 def target_tables(path: str | os.PathLike) -> list[dict[str, Any]]:
     """The ``[[target]]`` of a kit, as they are stated."""
     return [table.model_dump(exclude_unset=True) for table in read_toml(path, _Kit).target]
+
+
+def kit_lengths(path: str | os.PathLike) -> list[ReferenceLength]:
+    """The certified lengths between sockets of a kit; `InputError` where an end is no socket of it."""
+    content = read_toml(path, _Kit)
+    sockets = [socket.name for socket in getattr(content, "socket", ()) if not socket.target]
+    lengths = []
+    for entry in content.length:
+        with naming(f"{path}: [[length]] {entry.start} - {entry.end}"):
+            for end in (entry.start, entry.end):
+                if end not in sockets:
+                    raise InputError(f"the kit has no [[socket]] '{end}' (without a target); name two that it has.")
+            lengths.append(entry.between(entry.start, entry.end))
+    return lengths
 
 
 def kit_targets(path: str | os.PathLike) -> dict[str, AbstractTarget]:

@@ -1,5 +1,6 @@
 """What devices give: one reading of a moment, of the joints, of an instrument, or of both."""
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -30,6 +31,12 @@ class Sample(NamedTuple):
     q: Float[np.ndarray, " n"] | None = None
     columns: Mapping[str, float] = {}
     measured: Mapping[str, Float[np.ndarray, "..."] | Int[np.ndarray, "..."]] = {}
+
+
+def lines_of(samples: Sequence[Sample]) -> bytes:
+    """Samples as lines of JSON, for devices that send none."""
+    rows = ({name: value for name, value in sample._asdict().items() if value is not None} for sample in samples)
+    return b"".join(json.dumps(row, default=lambda value: value.tolist()).encode() + b"\n" for row in rows)
 
 
 def mean_measured(measured: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:

@@ -23,7 +23,7 @@ from .devices import open_device
 from .devices.device import AbstractDevice
 from .journal import Journal, journal_of
 from .places import COLUMNS, Place, Setup
-from .samples import BUTTONS, Sample, mean_measured
+from .samples import BUTTONS, Sample, lines_of, mean_measured
 from .shown import headline, links_of, shown_readings, state_of
 from .stillness import Rest, Stillness
 from .written import written
@@ -43,7 +43,7 @@ class Session:
         path: Where `finish` writes the capture; its journal is beside it, and is continued if it exists.
         target: Expanded uncertainty of a length that is enough, mm; None for none.
         automatic: Whether a pose is taken by itself at every rest in a place.
-        stream: File to which everything that devices send is appended; by default it is not kept.
+        stream: File to which everything that devices send is appended, line by line; by default it is not kept.
 
     Raises:
         InputError: A device or the journal cannot be used, or the journal is of another capture.
@@ -202,6 +202,8 @@ class Session:
                 thread.join(5.0 if thread is not self._threads[0] else 0.5)  # nobody waits for guidance
         for device in self._devices:
             device.close()
+            if self._stream is not None:
+                self._stream.write(device.raw())
         self._devices = []
         if self._stream is not None:
             self._stream.close()
@@ -316,7 +318,8 @@ class Session:
             with self._lock:
                 try:
                     if self._stream is not None:
-                        self._stream.write(raw)
+                        self._stream.write(raw or lines_of(samples))
+                        self._stream.flush()
                     self._add(samples)
                 except Exception as error:  # whatever one device sends, the others are read on
                     self._say(error)

@@ -15,7 +15,7 @@ from ..data.observations.measured import SimulatedDistances, SimulatedPoints
 from ..data.observations.simulated import AbstractSimulated
 from ..files.arms import load_noise, load_specification
 from ..files.inputs import InputFile
-from ..files.kits import kit_targets, read_kit
+from ..files.kits import kit_lengths, kit_targets, read_kit
 from ..files.manifest_tables import PosesManifest
 from ..files.text_table import TextTable
 from ..files.toml import read_toml
@@ -58,7 +58,8 @@ def read_setup(
     specification = load_specification(arm, base=base, tip=tip)
     noise = load_noise(arm, base=base, tip=tip)
     if kit is not None:
-        return setup_of(specification, noise, read_kit(kit))._replace(targets=kit_targets(kit))
+        things = read_kit(kit, lengths=True)
+        return setup_of(specification, noise, things, kit_lengths(kit))._replace(targets=kit_targets(kit))
     path = Path(str(plan))
     model: Any = read_toml(path, PosesManifest)
     planned = _planned_poses(path.with_suffix(".csv"), specification.arm)

@@ -1,5 +1,6 @@
 """Lines of devices: what a format reads of them, and a cable that is pulled."""
 
+import os
 import time
 from functools import partial
 
@@ -213,6 +214,26 @@ def test_a_file_is_followed_where_it_is_cut_or_replaced_and_a_half_line_waits(tm
     read += read_all(device, lambda: device.lines == 54)
     assert [sample.q[0] for sample in read] == [1, 2, 4, *[5] * 50]
     assert device.bad == {"half a line": 1}
+    device.close()
+
+
+def test_what_is_written_just_before_a_file_is_replaced_is_read(tmp_path, monkeypatch):
+    source, path = Growing(tmp_path), tmp_path / "recorder.csv"
+    device, looked = aj.live.open_device(f"file:{source.where}", setup_of(1)), os.fstat
+
+    def rotated(number):
+        if not path.with_suffix(".1").exists():
+            source.send(b"2,0,0\n")
+            path.rename(path.with_suffix(".1"))
+        return looked(number)
+
+    source.send(b"q_1_rad,q_2_rad,q_3_rad\n1,0,0\n")
+    read = read_all(device, lambda: device.lines == 1)
+    monkeypatch.setattr(os, "fstat", rotated)  # what is asked once there is nothing more to read
+    read += read_all(device, lambda: not device.connected)
+    source.send(b"3,0,0\n")
+    read += read_all(device, lambda: device.lines == 3)
+    assert [sample.q[0] for sample in read] == [1, 2, 3]
     device.close()
 
 

@@ -1,12 +1,16 @@
 """Live captures from files, and the command in a terminal."""
 
+import re
+import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.live.guidance import Guide
 
 KIT = """
 [[artefact]]
@@ -114,6 +118,64 @@ def test_instruments_and_sessions_make_a_capture(tmp_path):
     np.testing.assert_array_equal(tracker.points, [poses[1].measured["points"], poses[5].measured["points"]])
     with pytest.raises(aj.InputError, match="has no measured point"):
         aj.live.capture_of(setup, [poses[1]._replace(measured={})])
+
+
+LENGTH = """
+[[socket]]
+name = "B"
+point = [400, 500, 300]
+[[length]]
+from = "A"
+to = "B"
+value = 300.02
+u = 0.002
+"""
+
+
+def kit_of_sockets(folder, lengths):
+    (folder / "kit.toml").write_text(KIT[KIT.index("[[socket]]") : KIT.index("[[points]]")] + lengths)
+    return aj.live.read_setup("cheng2018-simulation", kit=folder / "kit.toml")
+
+
+@pytest.mark.slow
+def test_certified_lengths_of_a_kit_give_the_scale(tmp_path):
+    assert Guide(kit_of_sockets(tmp_path, LENGTH), 0.1).search.scaled
+    assert not Guide(kit_of_sockets(tmp_path, LENGTH[: LENGTH.index("[[length]]")]), 0.1).search.scaled
+
+
+def test_certified_lengths_of_a_kit_are_in_the_capture(tmp_path):
+    setup, random = kit_of_sockets(tmp_path, LENGTH), np.random.default_rng(0)
+    poses = [aj.live.TakenPose(i, "AB"[i % 2], 0.0, random.normal(size=6), np.zeros(6)) for i in range(4)]
+    for taken, sessions in ((poses, [""]), ([p._replace(session=1 + (p.number > 1)) for p in poses], ["1", "2"])):
+        lengths = aj.live.capture_of(setup, taken)[0].lengths
+        ends = [(f"session {s}/A", f"session {s}/B") if s else ("A", "B") for s in sessions]
+        assert [(length.start, length.end) for length in lengths] == ends
+        assert {(float(length.value), float(length.u)) for length in lengths} == {(300.02, 0.002)}
+    at = aj.live.open_device("simulated:?seed=1", setup).positions
+    assert np.linalg.norm(at["A"] - at["B"]) == pytest.approx(300.02, abs=1e-9)
+    with pytest.raises(aj.InputError, match=r"\[\[length\]\], which only a live capture uses"):
+        aj.files.read_kit(tmp_path / "kit.toml")
+    with pytest.raises(aj.InputError, match=r"A - C: the kit has no \[\[socket\]\] 'C'"):
+        kit_of_sockets(tmp_path, LENGTH.replace('to = "B"', 'to = "C"'))
+
+
+@pytest.mark.slow
+def test_the_plan_of_the_laboratorys_page_is_captured(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "readers" / "measuring_arm_laboratory.md").read_text()
+    (planning,) = re.findall(r"^\$ aacmm (plan (?:.*\\\n)*.*)$", page, re.M)
+    (capturing,) = re.findall(r"^aacmm (live .*)$", page, re.M)
+    command = [sys.executable, "-m", "aacmm_jax"]
+    subprocess.run(
+        [*command, *shlex.split(planning.replace("\\\n", " "))], cwd=tmp_path, check=True, capture_output=True
+    )
+    simulated = shlex.split(capturing.replace("serial:/dev/ttyUSB0", "'simulated:?speed=20'"))
+    live = subprocess.Popen(
+        [*command, *simulated, "--terminal"], cwd=tmp_path, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert live.stdout.readline().startswith("pose 1 in ")
+    output, _ = live.communicate("q", timeout=120)
+    assert live.returncode == 0, output
+    assert "are kept in capture.h5.journal" in output
 
 
 def test_a_robot_of_several_chains_is_captured_chain_by_chain():

@@ -59,7 +59,7 @@ class AbstractDevice(abc.ABC):
         """Give up the connection."""
 
     def raw(self) -> bytes:
-        """What came since the last call as it came, where that is kept; else nothing."""
+        """Whole lines that came since the last call, as they came; nothing of what sends no lines."""
         return b""
 
     def state(self) -> dict[str, Any]:

@@ -34,8 +34,11 @@ class File(AbstractLines):
         came = self._file.read(_MOST)
         if came:
             return came
-        now, own = os.stat(self._path), os.fstat(self._file.fileno())
-        if (now.st_ino, now.st_dev) != (own.st_ino, own.st_dev) or now.st_size < self._file.tell():
+        own = os.fstat(self._file.fileno())
+        now = os.stat(self._path) if self._path.exists() else None
+        if now is None or (now.st_ino, now.st_dev) != (own.st_ino, own.st_dev) or now.st_size < self._file.tell():
+            if rest := self._file.read(_MOST):  # written before it was replaced
+                return rest
             raise OSError(None, "the file begins anew")
         time.sleep(0.02)
         return b""

@@ -11,6 +11,7 @@ from .line_format import LONGEST, format_of_lines
 
 RETRY = 0.5  # s between attempts to connect
 _QUIET = 0.1  # s: where nothing comes for so long after connecting, the first line is whole
+_MOST_RAW = 100_000  # bytes without an end of a line
 _SILENT = 3.0  # s without a line after which people are told
 
 
@@ -118,9 +119,10 @@ class AbstractLines(AbstractDevice):
         return samples
 
     def raw(self) -> bytes:
-        came = bytes(self._raw)
-        self._raw.clear()
-        return came
+        whole = self._raw.rfind(b"\n") + 1 if self.connected and len(self._raw) < _MOST_RAW else len(self._raw)
+        came = bytes(self._raw[:whole])
+        del self._raw[:whole]
+        return came if came.endswith(b"\n") or not came else came + b"\n"
 
     def close(self) -> None:
         self._disconnect()

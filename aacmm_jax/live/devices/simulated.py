@@ -46,6 +46,7 @@ _OPTIONS = {
 _FASTEST = 1.2  # rad/s, or m/s of prismatic joints
 _AHEAD = 0.5  # s that are computed at once
 _IDLE = 0.1  # s that an operator without a goal waits for one
+_SWEEPS = 100  # over the certified lengths, to satisfy all of them
 _LIFT = 0.05  # rad or mm: how far joints move to lift the probe out of its seat
 _TRIES = 12
 
@@ -89,7 +90,7 @@ class Simulated(AbstractDevice):
         self._goals: deque[tuple[Place | None, np.ndarray]] = deque(maxlen=1)  # set by another thread
 
     def _true_positions(self) -> dict[str, Float[np.ndarray, " 3"]]:
-        """Things stand a little elsewhere than expected, each as a whole."""
+        """Things stand a little elsewhere than expected, each as a whole, and sockets as far apart as is certified."""
         found = {}
         for places in by_thing(self.setup).values():
             shift = self.options["place"] * self.random.uniform(-1, 1, 3) / np.sqrt(3)
@@ -98,6 +99,10 @@ class Simulated(AbstractDevice):
             if known:
                 middle = np.mean(list(known.values()), axis=0)
                 found |= {name: middle + turn @ (tip - middle) + shift for name, tip in known.items()}
+        for length in [length for length in self.setup.lengths if {length.start, length.end} <= set(found)] * _SWEEPS:
+            apart = found[length.end] - found[length.start]
+            step = 0.5 * (float(length.value) / np.linalg.norm(apart) - 1) * apart
+            found |= {length.start: found[length.start] - step, length.end: found[length.end] + step}
         return found
 
     def asked(self, place: Place | None, q: Float[np.ndarray, " n"] | None) -> None:
