@@ -91,6 +91,7 @@ class Search:
         self.scaled = bool(measured)  # whether anything determines the scale; else that of the nominal arm is taken
         self._names = {place.name: i for i, place in enumerate(setup.places)}
         self._pools: dict[tuple[str, str], Pool] = {}
+        self._without_unseen(self._pool([drawn], "", "").candidates)
         every = np.full(len(setup.places), LEAST_POSES)
         stated, self.planned = self._stated(drawn)
         first = [stated, drawn] if self.planned else [drawn]
@@ -101,6 +102,18 @@ class Search:
         self._sets = [*first, self._near(first[0])]
         if len(first) == 1:
             self.planned = self.chosen(self.pool().candidates, len(self.planned), self.planned, every, sweeps=2)
+
+    def _without_unseen(self, candidates: Candidates) -> None:
+        """Take parameters that no candidate sees as exact, as the probe where a camera is beside it."""
+        names = self.problem.space.names
+        seen = np.abs(candidates.rows[:, :, : len(names)]).max(axis=(0, 1)) > 0
+        objective, lengths = self.problem.objective, self.problem.lengths * seen
+        if objective.kind == "functions":
+            objective = objective._replace(functions=objective.functions * seen)
+        self.problem = self.problem._replace(objective=objective, lengths=lengths)
+        if not seen.all():
+            unseen = ", ".join(name for name, known in zip(names, seen, strict=True) if not known)
+            self.unreached[""] = f"Nothing here measures {unseen}: U takes them as exact."
 
     def away(self, q: Float[np.ndarray, "... n"], other: Float[np.ndarray, "... n"]) -> Float[np.ndarray, "..."]:
         """How far joints move from one configuration to another, summed, rad."""

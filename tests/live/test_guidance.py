@@ -2,6 +2,7 @@
 
 import itertools
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.kinematics.arm import joint_limits
 from aacmm_jax.kinematics.inverse_kinematics import project_to_targets
+from aacmm_jax.live.candidates import Search
 from aacmm_jax.live.guidance import Guidance, Guide, NextPose
 from aacmm_jax.live.places import Setup, TakenPose, setup_of
 from aacmm_jax.planning.problem import PlanOptions
@@ -183,3 +185,14 @@ def test_poses_that_were_skipped_are_not_proposed_again() -> None:
             skipped.append(asked)
     assert wrong is not None
     assert wrong.again is not None
+
+
+@pytest.mark.slow
+def test_what_nothing_measures_is_taken_as_exact() -> None:
+    kit = Path(__file__).parents[2] / "examples" / "webcam" / "kit.toml"
+    search = Search(aj.live.read_setup("so100", kit=kit))
+    columns = zip(search.problem.space.names, search.problem.lengths.T, strict=True)
+    unseen = [name for name, column in columns if not column.any()]
+    assert unseen
+    assert all(name.startswith("probe_") for name in unseen)
+    assert f"Nothing here measures {', '.join(unseen)}: U takes them as exact." in search.unreached.values()
