@@ -329,7 +329,11 @@ def _protocol() -> type:
             super().connection_made(transport)
             if len(self.connections) > _CONNECTIONS:
                 transport.close()
-            self.loop.call_later(_IDLE, self.close_if_idle)
+            self._idle = self.loop.call_later(_IDLE, self.close_if_idle)
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            self._idle.cancel()  # it would keep what was received until then
+            super().connection_lost(exc)
 
         def close_if_idle(self) -> None:
             if self.transport.is_closing():
@@ -337,7 +341,7 @@ def _protocol() -> type:
             if self.cycle is None or self.cycle.response_complete:
                 self.transport.close()
             else:
-                self.loop.call_later(_IDLE, self.close_if_idle)
+                self._idle = self.loop.call_later(_IDLE, self.close_if_idle)
 
     return Limited
 
