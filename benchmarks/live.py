@@ -34,9 +34,9 @@ from aacmm_jax.kinematics.workspace import reached
 from aacmm_jax.live.candidates import Search
 from aacmm_jax.live.guidance import Guide
 from aacmm_jax.live.places import Setup, TakenPose, setup_of
+from aacmm_jax.live.proposals import Proposals
 from aacmm_jax.live.samples import Sample
 from aacmm_jax.live.stillness import Stillness
-from aacmm_jax.planning.motion import joint_weights
 
 FILE = Path(__file__).parent / "results" / "live.json"
 LAYOUTS = (("cheng2018-simulation", 0), ("panda", 0), ("cheng2018-simulation", 1), ("panda", 1), ("ur10e", 0))
@@ -86,19 +86,25 @@ def counted(search: Search, rows: np.ndarray, order: np.ndarray, target: float) 
 
 
 def guided(search: Search, rows: np.ndarray, target: float) -> int:
-    """How many poses guidance takes."""
-    pool, ahead, now, taken = search.pool(), list(search.planned), None, np.zeros(len(search.setup.places), dtype=int)
-    information, weights = pool.candidates.base.copy(), joint_weights(search.problem.arm)
+    """How many poses guidance takes, each where it is proposed."""
+    pool, ahead, now, taken = search.pool(), list(search.planned), None, list[TakenPose]()
+    names = [place.name for place in search.setup.places]
+    information, counts = pool.candidates.base.copy(), np.zeros(len(names), dtype=int)
     for number in range(1, MOST):
-        away = np.zeros(len(ahead)) if now is None else np.abs((pool.q[ahead] - now) * weights).sum(axis=1)
-        best = ahead.pop(int(np.argmin(away)))
-        now, taken[pool.place[best]] = pool.q[best], taken[pool.place[best]] + 1
+        known = pool.known(information)
+        proposed = Proposals(search, known, search.problem.arm, {}, taken, now, ()).best(ahead, None)
+        if proposed is None:
+            return MOST
+        same = (pool.place == names.index(proposed.place)) & (pool.q == proposed.q).all(axis=1)
+        best, now = int(np.flatnonzero(same)[0]), proposed.q
+        ahead = [row for row in ahead if row != best]
+        taken.append(TakenPose(number, proposed.place, 0.0, now, np.zeros(len(now))))
+        counts[pool.place[best]] += 1
         information = information + rows[best].T @ rows[best]
         u = search.u(information)
         if u <= target:
             return number
-        known = pool.known(information)
-        ahead = search.ahead(known, ahead, np.maximum(2 - taken, 0), target if u < 3 else None)
+        ahead = search.ahead(pool.known(information), ahead, np.maximum(2 - counts, 0), target if u < 3 else None)
     return MOST
 
 
