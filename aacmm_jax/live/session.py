@@ -3,6 +3,7 @@
 Everything that people see is `Session.state`; everything that they do is a method.
 """
 
+import atexit
 import os
 import threading
 import time
@@ -32,6 +33,7 @@ _LOOK_EVERY = 0.1  # s of rest
 _MOST_MEASURED = 500
 _APART = 0.02  # rad, or m of prismatic joints: least change of a joint between two poses that are taken by themselves
 _LONGEST_TEXT = 200
+_LONGEST_END = 60.0  # s
 
 
 class Session:
@@ -113,6 +115,7 @@ class Session:
         self._threads = [threading.Thread(target=self._compute, name="live guidance", daemon=True)]
         for device in self._devices:  # each its own: one that cannot be reached holds up no other
             self._threads.append(threading.Thread(target=self._read_device, args=(device,), daemon=True))
+        atexit.register(self._end)
         for thread in self._threads:
             thread.start()
         self._wake.set()
@@ -208,9 +211,17 @@ class Session:
         if self._stream is not None:
             self._stream.close()
             self._stream = None
+        if not any(thread.is_alive() for thread in self._threads[:1]):
+            atexit.unregister(self._end)
         if not self._closed:
             self._closed = True
             self._journal.close()
+
+    def _end(self) -> None:
+        """Before the process ends, which a thread within compiled code would abort."""
+        self.close()
+        for thread in self._threads[:1]:
+            thread.join(_LONGEST_END)
 
     def __enter__(self) -> "Session":
         return self
@@ -376,6 +387,8 @@ class Session:
             found, proposed, message = None, None, ""
             try:
                 guide = guiding.Guide(self.setup, self.target) if guide is None else guide
+                if self._stop.is_set():
+                    return
                 try:
                     found = guide.calibrated(poses)
                 except InputError as error:  # of data that do not determine enough yet

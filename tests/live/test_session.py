@@ -276,3 +276,34 @@ def killed_at_random(folder: Path, kills: int, seed: int) -> dict[str, int]:
 @pytest.mark.slow
 def test_a_killed_capture_has_every_pose_that_it_told(tmp_path):
     assert killed_at_random(tmp_path, 3, seed=1)["told"] > 0
+
+
+ENDING = """
+import sys, time
+import jax
+import aacmm_jax as aj
+from aacmm_jax.live import guidance
+from tests.live.killed import Hasty, setup
+from tests.live.unguided import NoGuide
+
+class Compiling(NoGuide):
+    def __init__(self, *_):
+        until, size = time.monotonic() + 3, 3
+        while time.monotonic() < until:
+            size += 1
+            jax.jit(lambda x: sum((x * i) @ x.T for i in range(50))).lower(jax.numpy.ones((size, size))).compile()
+
+guidance.Guide = Compiling
+session = aj.live.Session(setup(), [Hasty(1)], path=sys.argv[1])
+time.sleep(0.5)
+if sys.argv[2] == "closed":
+    session.close()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["closed", "left"])
+def test_a_process_ends_well_while_guidance_is_compiled(tmp_path, how):
+    command = [sys.executable, "-c", ENDING, str(tmp_path / "capture.h5"), how]
+    ended = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=120)
+    assert (ended.returncode, ended.stderr) == (0, "")

@@ -1,7 +1,6 @@
 """A capture in a terminal of its own: its keys, and what is left however it ends."""
 
 import contextlib
-import fcntl
 import os
 import select
 import signal
@@ -25,10 +24,14 @@ poses = 4
 """
 
 
-def own_terminal() -> None:
-    """As a login gives it: what hangs up ends what runs in it."""
-    os.setsid()
-    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+# As a login gives it: what hangs up ends what runs in it. JAX allows no fork of this process.
+OWN_TERMINAL = """
+import fcntl, os, sys, termios
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+    "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv(*(sys.argv[1], sys.argv[1:]))"
+)
 
 
 @pytest.mark.slow
@@ -40,6 +43,7 @@ def own_terminal() -> None:
 def test_however_a_capture_ends_its_poses_are_kept_and_the_terminal_is_as_before(tmp_path, end, status):
     (tmp_path / "kit.toml").write_text(KIT)
     command = [sys.executable, "-m", "aacmm_jax", "live", "cheng2018-simulation", "--terminal", "--kit", "kit.toml"]
+    command = [sys.executable, "-c", OWN_TERMINAL, *command]
     command += ["--device", "simulated:?speed=20", "-o", "c.h5", "--keep-stream", "stream.txt", "--capture-only"]
     terminal, own = os.openpty()
     before, seen, journal = termios.tcgetattr(own), b"", tmp_path / "c.h5.journal"
@@ -51,7 +55,7 @@ def test_however_a_capture_ends_its_poses_are_kept_and_the_terminal_is_as_before
         return b""
 
     with subprocess.Popen(
-        command, cwd=tmp_path, stdin=own, stdout=own, stderr=own, preexec_fn=own_terminal,
+        command, cwd=tmp_path, stdin=own, stdout=own, stderr=own, start_new_session=True,
         env={**os.environ, "TERM": "xterm"},
     ) as process:  # fmt: skip
         while time.monotonic() < until and (not journal.exists() or journal.read_bytes().count(b'"pose"') < 3):
