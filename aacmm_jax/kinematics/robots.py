@@ -207,8 +207,11 @@ def chains_taken(robot: Arm, q: Float[np.ndarray, "N columns"]) -> tuple[str, ..
 
 
 def chains_of(robot: Arm) -> dict[str, ChainOf]:
-    """All chains of a robot by name, without joint corrections."""
+    """All chains of a robot by name, without joint corrections; a joint that follows one of another chain moves by
+    itself in them, so that they say where the links are, and not which poses there are."""
     plain = without_corrections(robot) if robot.corrections is not None else robot
+    within = [row for row in plain.mimic if all(row[1] in joints for _, joints in plain.chains if row[0] in joints)]
+    plain = plain.replace(mimic=within) if len(within) < len(plain.mimic) else plain
     return {name: chain_of(plain, name) for name, _ in robot.chains}
 
 

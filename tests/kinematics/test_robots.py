@@ -195,8 +195,9 @@ def test_refused_in_one_sentence(what):
 
 
 @pytest.mark.slow
-def test_calibrated_together_within_their_uncertainty():
-    whole = ROBOTS["two bases"][1]
+@pytest.mark.parametrize("mimic", [[], [(11, 3, 0.5, 0.1)]], ids=["", "a joint follows one of the other chain"])
+def test_calibrated_together_within_their_uncertainty(mimic):
+    whole = ROBOTS["two bases"][1].replace(mimic=mimic)
     space = aj.Parameters.independent(whole)
     true = aj.perturbed_arm(space, length=1.0, angle=0.002, seed=1)
     capture = aj.simulate(

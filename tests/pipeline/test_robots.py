@@ -36,7 +36,9 @@ SERVED = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", SERVED)
+@pytest.mark.parametrize(
+    "what", [pytest.param(what, marks=pytest.mark.exhaustive if what == "bootstrap" else ()) for what in SERVED]
+)
 def test_robots_are_served(robot, what):
     assert SERVED[what](*robot) is not None
 
