@@ -44,6 +44,7 @@ DESCRIPTIONS = {
     "tip": "For a URDF: the link at the end, or a list of those at the ends of a robot's chains.",
     "bases": "Rough bases of a robot's arms in the base of the first: x, y, z (mm), and roll, pitch, yaw (deg).",
     "chain": "For a robot: the chain that the poses of the table are of.",
+    "link": "The link that touches: the number of the joint before it, or in a URDF its name. By default the last one.",
     "base": "For a URDF: the link that does not move.",
     "acceptance": "Standards for whose acceptance procedure the poses were recorded.",
     "angles": "How readings are written.",
