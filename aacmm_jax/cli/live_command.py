@@ -35,6 +35,9 @@ def live(
     target_mm: float | None = option(f"{U_AT_LEVEL} of a length at which to stop.", min=0),
     terminal: bool = flag("--terminal", "Show the capture in this terminal instead of a browser."),
     manual: bool = flag("--manual", "Take poses by a key or the arm's button only, and not at every rest."),
+    both_sides: bool = flag(
+        "--both-sides", "Take every pose twice, with each joint from one side and from the other, which shows play."
+    ),
     capture_only: bool = flag("--capture-only", "Do not calibrate when the capture is finished."),
     keep_stream: Path | None = option("Also append everything that the devices send to this file.", "FILE"),
     port: int = option("Port of the page. Default: a free one.", "N", default=0, min=0, max=65535),
@@ -59,7 +62,8 @@ def live(
 
     given: dict[str, Any] = {"base": base, "tip": tip}
     setup = read_setup(arm, plan=plan, kit=kit, **given)
-    with Session(setup, device, path=output, target=target_mm, automatic=not manual, stream=keep_stream) as session:
+    given = {"target": target_mm, "automatic": not manual, "stream": keep_stream, "both_sides": both_sides}
+    with Session(setup, device, path=output, **given) as session:
         if terminal:
             from ..live.terminal import show
 

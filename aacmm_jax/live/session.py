@@ -21,11 +21,12 @@ from ..kinematics.arm import Arm, by_joint
 from . import guidance as guiding
 from .captured import Captured, Whereabouts
 from .devices import open_device
-from .devices.device import AbstractDevice
+from .devices.device import AbstractDevice, check_joints
 from .journal import Journal, journal_of
 from .places import COLUMNS, Place, Setup
 from .samples import BUTTONS, Sample, lines_of, mean_measured
 from .shown import headline, links_of, shown_readings, state_of
+from .sides import Sides, check_nothing_holds, from_both_sides, sides_of
 from .stillness import Rest, Stillness
 from .written import written
 
@@ -46,9 +47,11 @@ class Session:
         target: Expanded uncertainty of a length that is enough, mm; None for none.
         automatic: Whether a pose is taken by itself at every rest in a place.
         stream: File to which everything that devices send is appended, line by line; by default it is not kept.
+        both_sides: Whether every pose is taken twice, with each joint from one side and from the other.
 
     Raises:
-        InputError: A device or the journal cannot be used, or the journal is of another capture.
+        InputError: A device or the journal cannot be used, the journal is of another capture, or something holds the
+            tip, which is to be moved from both sides.
 
     Example:
         >>> import time
@@ -73,7 +76,10 @@ class Session:
         target: float | None = None,
         automatic: bool = True,
         stream: str | os.PathLike | None = None,
+        both_sides: bool = False,
     ):
+        if both_sides:
+            check_nothing_holds(setup)
         self.setup, self.path, self.target = setup, Path(path), target
         self._arm: Arm = to_numpy(setup.specification.arm)
         self._lock, self._wake, self._stop = threading.RLock(), threading.Event(), threading.Event()
@@ -97,7 +103,8 @@ class Session:
         self._taken_until = -np.inf  # time of the device up to which rest has been used
         self._looked_at = -np.inf  # and when it was last looked at
         self._taken_q: Float[np.ndarray, " n"] | None = None
-        self._stillness = Stillness(self._arm.joints)
+        self._stillness, self._sides = Stillness(self._arm.joints), Sides(self._arm)
+        self._both_sides, self._taken_sides = both_sides, np.zeros(self._arm.joints)
         self._pressed: frozenset[str] = frozenset()  # buttons of the arm
         self._journal, self._closed = Journal(journal_of(self.path)), False
         self._devices: list[AbstractDevice] = []
@@ -107,8 +114,9 @@ class Session:
             self._where = Whereabouts(setup, self._arm, self._captured.poses, None)
             if self._captured.poses:  # an arm that still is where it was when the last process ended is not taken again
                 self._taken_q = self._captured.poses[-1].q
+                self._taken_sides = sides_of(self._captured.poses[-1].columns, self._arm.joints)
             self._devices = [open_device(d, setup) if isinstance(d, str) else d for d in devices]
-            self._check_devices()
+            check_joints(self._devices, self._arm.joints)
         except BaseException:
             self.close()
             raise
@@ -278,16 +286,6 @@ class Session:
         self._where = Whereabouts(self.setup, self._arm, self._captured.poses, self._where.guidance)
         self._changed(compute=True)
 
-    def _check_devices(self) -> None:
-        if not any(device.joints for device in self._devices):
-            raise InputError("no device reads the joints; add one with --device.")
-        for device in self._devices:
-            if device.joints not in (0, self._arm.joints):
-                raise InputError(
-                    f"device {device.name} reads {device.joints} joints, but the arm has {self._arm.joints}; correct "
-                    "its line format, or name the right arm."
-                )
-
     def _say(self, error: Exception) -> None:
         if self._message != in_words(error):
             self._message = in_words(error)
@@ -305,6 +303,7 @@ class Session:
     def _take(self, rest: Rest, place: Place) -> int:
         measured = mean_measured(self._measured) if place.is_free else {}
         columns = {name: value for name, value in self._columns.items() if name not in BUTTONS}
+        columns = self._sides.columns() | columns  # what a device knows of its directions counts first
         if self._captured.temperature is not None:
             columns[COLUMNS["thermometer"]] = self._captured.temperature
         number = self._captured.number + 1
@@ -315,6 +314,7 @@ class Session:
             }
         )  # fmt: skip
         self._taken_until, self._taken_q, self._forced = rest.until, rest.q, None
+        self._taken_sides = sides_of(columns, self._arm.joints)
         self._sound += 1
         return number
 
@@ -350,6 +350,7 @@ class Session:
                     self._stillness, self._taken_until, self._looked_at = Stillness(self._arm.joints), -np.inf, -np.inf
                 self._sample_time = sample.time
                 self._stillness.add(sample)
+                self._sides.add(sample.q)
                 if self._stillness.rest is None:
                     self._measured = []
                 self._sample_times.append(sample.time)
@@ -369,7 +370,9 @@ class Session:
         # A pose that is to be taken again is where it was, seated anew since that was said.
         if self._taken_q is not None and rest.since <= self._again[1]:
             moved = np.abs(rest.q - self._taken_q) / np.array(by_joint(self._arm, 1.0, 1000.0))
-            if np.max(moved) < _APART:
+            if np.max(moved) < _APART and not (
+                self._both_sides and np.mean(self._sides.now == self._taken_sides) < 0.5
+            ):
                 self._taken_until = rest.until  # also while it ends, with readings of the next motion in it
                 return
         place = self._place_at(self._tip_of(rest.q))
@@ -394,6 +397,8 @@ class Session:
                 except InputError as error:  # of data that do not determine enough yet
                     message = str(error)
                 proposed = guide.next_pose(found, q, forced, skipped)
+                if self._both_sides:
+                    proposed = from_both_sides(self._arm, proposed, poses, skipped)
             except Exception as error:  # poses are taken without guidance, too
                 message = in_words(error)
             with self._lock:
@@ -405,7 +410,8 @@ class Session:
                 self._changed()
                 if proposed is not None:
                     for device in self._devices:
-                        device.asked(self.setup.place(proposed.place), proposed.q)
+                        start = proposed.approach if self._both_sides else None
+                        device.asked(self.setup.place(proposed.place), proposed.q, start)
 
 
 def in_words(error: Exception) -> str:

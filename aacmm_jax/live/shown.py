@@ -69,6 +69,7 @@ def state_of(
         following = {
             "place": proposed.place,
             "q": shown_readings(nominal, proposed.q),
+            "from": None if proposed.approach is None else shown_readings(nominal, proposed.approach),
             "links": links_of(where.arm, proposed.q),
             "why": proposed.why,
             "distance": float(proposed.distance),

@@ -96,6 +96,9 @@ def _view(state: dict[str, Any], message: str) -> Any:
     still = "still" if live["still"] else "moving"
     tip = "no readings yet" if live["tip"] is None else "tip " + ", ".join(f"{x:.1f}" for x in live["tip"]) + " mm"
     lines = [Text(state["headline"], style="bold"), Text(f"{still}; {tip}; {live['rate']:.0f} readings/s")]
+    if (following := state["next"]) is not None:
+        texts = [", ".join(f"{x:.1f}" for x in q) for q in (following["from"], following["q"]) if q is not None]
+        lines.append(Text("next readings: " + " then ".join(texts)))
     places = Table("place", "poses", box=None)
     for place in state["places"]:
         places.add_row(Text(printable(place["name"])), f"{place['poses']} of {place['wanted']}")

@@ -3,7 +3,7 @@
 import abc
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -51,9 +51,9 @@ class AbstractDevice(abc.ABC):
         """What has come since the last call, the oldest first; waits for at most some hundredths of a second."""
 
     def asked(  # noqa: B027
-        self, place: Place | None, q: Float[np.ndarray, " n"] | None
+        self, place: Place | None, q: Float[np.ndarray, " n"] | None, start: Float[np.ndarray, " n"] | None = None
     ) -> None:
-        """Say which pose is wanted next; only what moves by itself heeds it."""
+        """Say which pose is wanted next, and where the motion to it begins; only what moves by itself heeds it."""
 
     def close(self) -> None:  # noqa: B027
         """Give up the connection."""
@@ -71,6 +71,18 @@ class AbstractDevice(abc.ABC):
             "bad": dict(self.bad),
             "message": self.message,
         }
+
+
+def check_joints(devices: Sequence[AbstractDevice], joints: int) -> None:
+    """`InputError` where no device reads the joints of an arm, or one reads those of another arm."""
+    if not any(device.joints for device in devices):
+        raise InputError("no device reads the joints; add one with --device.")
+    for device in devices:
+        if device.joints not in (0, joints):
+            raise InputError(
+                f"device {device.name} reads {device.joints} joints, but the arm has {joints}; correct its line "
+                "format, or name the right arm."
+            )
 
 
 def numbers_of(where: str, options: Mapping[str, str], known: Mapping[str, float]) -> dict[str, float]:

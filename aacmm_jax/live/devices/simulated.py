@@ -87,7 +87,8 @@ class Simulated(AbstractDevice):
         self._clock = self._now = 0.0  # simulated time up to which samples were computed, and were given
         self._read_at = time.monotonic()
         self._kept = np.eye(self.joints)  # motions that the seat allows
-        self._goals: deque[tuple[Place | None, np.ndarray]] = deque(maxlen=1)  # set by another thread
+        # Set by another thread.
+        self._goals: deque[tuple[Place | None, np.ndarray, np.ndarray | None]] = deque(maxlen=1)
 
     def _true_positions(self) -> dict[str, Float[np.ndarray, " 3"]]:
         """Things stand a little elsewhere than expected, each as a whole, and sockets as far apart as is certified."""
@@ -105,9 +106,11 @@ class Simulated(AbstractDevice):
             found |= {length.start: found[length.start] - step, length.end: found[length.end] + step}
         return found
 
-    def asked(self, place: Place | None, q: Float[np.ndarray, " n"] | None) -> None:
+    def asked(
+        self, place: Place | None, q: Float[np.ndarray, " n"] | None, start: Float[np.ndarray, " n"] | None = None
+    ) -> None:
         if q is not None:
-            self._goals.append((place, np.asarray(q, dtype=float)))
+            self._goals.append((place, np.asarray(q, dtype=float), start))
 
     def read(self) -> list[Sample]:
         elapsed = time.monotonic() - self._read_at
@@ -127,12 +130,14 @@ class Simulated(AbstractDevice):
     def _compute(self) -> None:
         """The next stretch: a motion to the goal and the hold there, or rest where the tip is."""
         try:
-            self._place, q = self._goals.pop()
+            self._place, q, start = self._goals.pop()
         except IndexError:
             self._hold(_IDLE)
             return
         wanted, self._seated = self._there(q)
-        if np.max(np.abs(wanted - self._q)) < _LIFT:  # a pose that is taken again is seated anew
+        if start is not None:
+            self._move(start)
+        elif np.max(np.abs(wanted - self._q)) < _LIFT:  # a pose that is taken again is seated anew
             self._move(np.clip(self._q + _LIFT, self.limits[:, 0], self.limits[:, 1]))
         self._move(wanted)
         self._kept = np.eye(self.joints)

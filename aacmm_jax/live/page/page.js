@@ -145,7 +145,9 @@ function live(now) {
   [...$("joints").children].forEach((pair, i) => {
     const unit = { deg: "°" }[state?.arm.joints[i]?.unit] ?? ` ${state?.arm.joints[i]?.unit ?? ""}`;
     put(pair.children[1], known(now.q?.[i]) ? `${now.q[i].toFixed(3)}${unit}` : "–");
-    put(pair.children[2], known(state?.next?.q?.[i]) ? `next ${state.next.q[i].toFixed(1)}${unit}` : "");
+    const start = state?.next?.from?.[i];
+    const next = known(start) ? `from ${start.toFixed(1)} to` : "next";
+    put(pair.children[2], known(state?.next?.q?.[i]) ? `${next} ${state.next.q[i].toFixed(1)}${unit}` : "");
   });
   view.show({ links: now.links ?? [], tip: now.tip ?? null });
   put($("rate"), known(now.rate) ? `${digits(now.rate, 2)} readings a second` : "");
