@@ -117,7 +117,8 @@ class Running:
         return said
 
 
-SLOWEST = ("SO-101 with a camera",)
+# Of the SCARA two of six captures end in a calibration that is worse than the nominal arm.
+SLOWEST = ("SO-101 with a camera", "SCARA")
 
 
 @pytest.mark.parametrize(
