@@ -23,12 +23,12 @@ from .captured import Captured, Whereabouts
 from .devices import open_device
 from .devices.device import AbstractDevice, check_joints
 from .journal import Journal, journal_of
-from .places import COLUMNS, Place, Setup
+from .places import COLUMNS, Place, Setup, TakenPose
 from .samples import BUTTONS, Sample, lines_of, mean_measured
 from .shown import headline, links_of, shown_readings, state_of
 from .sides import Sides, check_nothing_holds, from_both_sides, sides_of
 from .stillness import Rest, Stillness
-from .written import written
+from .written import fitting, written
 
 _LOOK_EVERY = 0.1  # s of rest
 _MOST_MEASURED = 500
@@ -190,12 +190,13 @@ class Session:
             self._changed(compute=True)
 
     def finish(self, calibrate: bool = True) -> list[str]:
-        """Write the capture, and the calibration with its report; the names of the files. The session goes on."""
+        """Write the capture, and the calibration with its report; the names of the files. The session goes on. Poses
+        that guidance leaves out, since they do not fit, are in the journal only."""
         with self._lock:
-            poses, self._busy = list(self._captured.poses), "Calibrating" if calibrate else "Writing"
+            self._busy = "Calibrating" if calibrate else "Writing"
             self._version += 1
         try:
-            paths = written(self.setup, poses, self.path, calibrate)
+            paths = written(self.setup, fitting(self._poses_seen, self._stop), self.path, calibrate)
         finally:
             with self._lock:
                 self._busy = None
@@ -271,6 +272,10 @@ class Session:
         }
 
     # Inside; with the lock held.
+
+    def _poses_seen(self) -> tuple[list[TakenPose], guiding.Guidance | None]:
+        with self._lock:
+            return list(self._captured.poses), self._where.guidance
 
     def _changed(self, compute: bool = False) -> None:
         self._version += 1

@@ -1,12 +1,30 @@
 """What a finished live capture writes: the capture, and its calibration with the report."""
 
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ..data.recording import Recording
 from ..files.captures import save_capture
+from .guidance import Guidance
 from .places import Setup, TakenPose, capture_of
+
+_LONGEST = 10.0  # s, for guidance to see the last pose
+
+
+def fitting(look: Callable[[], tuple[Sequence[TakenPose], Guidance | None]], stop: threading.Event) -> list[TakenPose]:
+    """The poses that guidance does not leave out: ``look`` gives all of them, and what guidance has found. Where it has
+    not seen the last one yet, it is waited for, some seconds at most, or until ``stop`` is set."""
+    until = time.monotonic() + _LONGEST
+    while True:
+        poses, guidance = look()
+        if guidance is None or not poses or poses[-1].excluded or poses[-1].number in guidance.poses:
+            break
+        if stop.wait(0.02) or time.monotonic() > until:
+            break
+    wrong = set() if guidance is None else {number for number, one in guidance.poses.items() if one.outlier}
+    return [pose for pose in poses if pose.number not in wrong]
 
 
 def written(setup: Setup, poses: Sequence[TakenPose], path: Path, calibrate: bool) -> list[str]:

@@ -4,8 +4,10 @@ import json
 import random
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +16,8 @@ import aacmm_jax as aj
 from aacmm_jax.live import guidance
 from aacmm_jax.live.devices.device import AbstractDevice
 from aacmm_jax.live.journal import Journal, journal_of
+from aacmm_jax.live.places import TakenPose
+from aacmm_jax.live.written import fitting
 from tests.live import killed
 from tests.live.unguided import NoGuide
 
@@ -307,3 +311,18 @@ def test_a_process_ends_well_while_guidance_is_compiled(tmp_path, how):
     command = [sys.executable, "-c", ENDING, str(tmp_path / "capture.h5"), how]
     ended = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=120)
     assert (ended.returncode, ended.stderr) == (0, "")
+
+
+def test_what_guidance_leaves_out_is_not_written():
+    """One pose of twenty that is 0.5 mm off makes the calibration of a SCARA worse than its nominal arm."""
+    poses = [TakenPose(number, "A", 0.0, np.zeros(6), np.zeros(6)) for number in (1, 2, 3)]
+    looks = [{1: False, 2: True}, {1: False, 2: True, 3: False}]  # the last pose is seen at the second look
+
+    def look():
+        outliers = looks.pop(0) if len(looks) > 1 else looks[0]
+        found = {number: SimpleNamespace(outlier=outlier) for number, outlier in outliers.items()}
+        return poses, SimpleNamespace(poses=found)
+
+    assert [pose.number for pose in fitting(look, threading.Event())] == [1, 3]
+    assert len(looks) == 1
+    assert fitting(lambda: (poses, None), threading.Event()) == poses
