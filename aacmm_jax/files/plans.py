@@ -23,11 +23,11 @@ from ..kinematics.parameters import UrdfSource
 from ..kinematics.robots import chain_of, chains_taken
 from ..planning.design import Plan
 from ..planning.kit import KitPlan
+from ..planning.motion import start_from
 from .outputs import write_text
 
 Angles = Literal["deg", "rad"]
 Planned = Plan | KitPlan | Procedure
-_BACK, _BACK_LINEAR = 2 * DEG, 10.0  # rad, mm: motion before a pose, which must be larger than the play
 _IN_SPACE = ("points", "transforms", "pixels")  # kinds of observations that leave the tip free
 
 
@@ -125,13 +125,12 @@ def _from_both_sides(plan: Planned, q: np.ndarray, tips: np.ndarray) -> Iterator
             f"it, but {what}; plan for an instrument or camera that sees the arm (--kit)."
         )
     n, random = plan.arm.joints, np.random.default_rng(0)
-    back = np.append(by_joint(plan.arm, _BACK, _BACK_LINEAR), np.zeros(q.shape[1] - n))
     for i, (reading, tip) in enumerate(zip(q, tips, strict=True)):
-        sides = random.choice([-1.0, 1.0], len(reading))
+        sides = random.choice([-1.0, 1.0], len(reading))[:n]
         for side in (sides, -sides):
-            start = reading - side * back
-            yield i, "approach", start, np.asarray(plan.arm.position(start)), side[:n]
-            yield i, "pose", reading, tip, side[:n]
+            start = np.append(start_from(plan.arm, reading[:n], side), reading[n:])
+            yield i, "approach", start, np.asarray(plan.arm.position(start)), side
+            yield i, "pose", reading, tip, side
 
 
 def _kit_poses(plan: KitPlan) -> tuple[list[list[str]], np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

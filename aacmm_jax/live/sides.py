@@ -7,12 +7,12 @@ from jaxtyping import Float
 
 from ..core.errors import InputError
 from ..core.units import DEG
-from ..kinematics.arm import Arm, by_joint, joint_limits
+from ..kinematics.arm import Arm, by_joint
+from ..planning.motion import start_from
 from .places import COLUMNS, Setup, TakenPose
 from .proposals import NextPose
 
 _REVERSAL, _REVERSAL_LINEAR = 0.1 * DEG, 0.1  # rad, mm: a joint that turns back by less trembles
-_BACK, _BACK_LINEAR = 2 * DEG, 10.0  # rad, mm: motion before a pose, which must be larger than the play
 _SAME, _SAME_LINEAR = 1 * DEG, 5.0  # rad, mm: poses that differ by less are one pose, reached twice
 
 
@@ -74,15 +74,9 @@ def from_both_sides(
             before = sides_of(last.columns, arm.joints)
             sides = np.where(before == 0, sides, -before)
             proposed = NextPose(last.place, q, f"Pose {last.number} again, each joint from its other side.", 0.0)
-    return None if proposed is None else proposed._replace(approach=_start(arm, proposed.q, sides))
+    return None if proposed is None else proposed._replace(approach=start_from(arm, proposed.q, sides))
 
 
 def _is_same(arm: Arm, q: Float[np.ndarray, " n"], other: Float[np.ndarray, " n"]) -> bool:
     away = np.abs(q[: arm.joints] - other[: arm.joints])
     return bool(np.all(away < by_joint(arm, _SAME, _SAME_LINEAR)))
-
-
-def _start(arm: Arm, q: Float[np.ndarray, " n"], sides: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Where the motion to a pose begins."""
-    lower, upper = np.asarray(joint_limits(arm, None)).T
-    return np.clip(q - sides * np.array(by_joint(arm, _BACK, _BACK_LINEAR)), lower, upper)

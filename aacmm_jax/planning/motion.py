@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..core.numpy_or_jax import to_numpy
-from ..kinematics.arm import Arm
+from ..core.units import DEG
+from ..kinematics.arm import Arm, by_joint, joint_limits
 from ..kinematics.chain import reading_units
 from ..kinematics.collisions import clearances, is_clear, nearest_contact
 from ..kinematics.inverse_kinematics import project_to_targets, readings_at_poses
@@ -21,6 +22,7 @@ _LEAST_WEIGHT = 0.1
 _BLOCKED = 1e4  # rad: what a move that hits something counts, more than any detour
 _MANY = 150  # poses, up to which every start is tried
 _IMPROVED = 6  # starts that are improved
+_BACK, _BACK_LINEAR = 2 * DEG, 10.0  # rad, mm: motion before a pose, which must be larger than the play
 
 
 class Motion(NamedTuple):
@@ -130,6 +132,13 @@ def hardly_reached(name: str, point: Float[np.ndarray, " 3"]) -> str:
         f"{name} at ({where}) mm cannot be reached in enough poses within the joint limits, inside the cone and clear "
         "of obstacles; change the position, widen the cone, shorten retract, or give more candidates."
     )
+
+
+def start_from(arm: Arm, q: Float[np.ndarray, " n"], sides: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Readings where the motion to a pose begins that each joint reaches with rising (1) or falling (-1) readings,
+    within the limits of the joints."""
+    lower, upper = np.asarray(joint_limits(arm, None)).T
+    return np.clip(q - sides * np.array(by_joint(arm, _BACK, _BACK_LINEAR)), lower, upper)
 
 
 def joint_weights(arm: Arm) -> Float[np.ndarray, " n"]:

@@ -117,7 +117,6 @@ class Running:
         return said
 
 
-# Of the SCARA two of six captures end in a calibration that is worse than the nominal arm.
 SLOWEST = ("SO-101 with a camera", "SCARA")
 
 
