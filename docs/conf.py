@@ -32,6 +32,7 @@ extensions = [
     "signatures",
     "command_pages",
     "file_pages",
+    "llms",
 ]
 exclude_patterns = ["_build", "notebooks/README.md"]
 nitpicky = True
