@@ -16,6 +16,8 @@ SENTENCE = re.compile(r"^.*?[.:?](?=\s|$)", flags=re.DOTALL)
 def _first_sentence(app: Sphinx, page: str) -> str:
     for paragraph in app.env.get_doctree(page).findall(nodes.paragraph):
         text = " ".join(paragraph.astext().split())
+        if isinstance(paragraph.parent, nodes.entry):  # of a table
+            continue
         if found := SENTENCE.match(text):
             return found.group().rstrip(":.") + "."
     return ""
