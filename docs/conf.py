@@ -35,6 +35,7 @@ extensions = [
     "file_pages",
     "gallery",
     "accessible",
+    "llms",
 ]
 exclude_patterns = ["_build", "notebooks/README.md"]
 nitpicky = True
