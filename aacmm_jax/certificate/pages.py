@@ -53,6 +53,7 @@ class Printed(NamedTuple):
 
 
 def pages_of(dcc: str, words: Language) -> Printed:
+    """What both pages say. Raises `InputError` if the text is no DCC of this package."""
     root = root_of(dcc)
     administrative = _first(root, "dcc:administrativeData")
     core = _first(administrative, "dcc:coreData")
