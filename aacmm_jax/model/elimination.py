@@ -63,8 +63,8 @@ def sums_by_component(
 ) -> Float[AnyArray, "K k h"]:
     """Products of both, summed over the rows of each component."""
     xp, count = namespace(first, second), len(sizes)
-    if not count:
-        return xp.zeros((0, first.shape[0], second.shape[0]))
+    if not (count and first.shape[0] and second.shape[0]):  # no component, or nothing but components is free
+        return xp.zeros((count, first.shape[0], second.shape[0]))
     if len(set(sizes)) == 1 and (xp is not np or sizes[0] >= _LONG):
         split = (part.reshape(*part.shape[:2], count, -1) for part in (first, second))
         left, right = (xp.moveaxis(part, 2, 0).reshape(count, part.shape[0], -1) for part in split)
