@@ -86,7 +86,7 @@ def followed(
     xp, (k, r, _) = namespace(by_own, matrices), by_own.shape
     if sum(sizes) >= _LONG * len(sizes):
         products = [matrix.T @ flat(by_own[..., poses]) for matrix, poses in zip(matrices, _slices(sizes), strict=True)]
-        pieces = [product.reshape(len(product), r, -1) for product in products]
+        pieces = [product.reshape(len(product), r, product.shape[1] // r) for product in products]
         return pieces[0] if len(pieces) == 1 else xp.concatenate(pieces, axis=-1)
     owner = owner_of(sizes)
     total: Any = 0.0
