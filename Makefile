@@ -158,5 +158,5 @@ benchmarks/peers/%/.venv/.done: benchmarks/peers/%/requirements.txt
 
 clean:
 	rm -rf .venv .venv-newest .venv-lowest aacmm-demo docs/_build docs/notebooks docs/reference/api
-	rm -f docs/reference/command_line.md
+	rm -rf docs/reference/command_line.md docs/reference/gallery*
 	git clean -qfX docs/reference/files
