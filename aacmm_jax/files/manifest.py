@@ -32,7 +32,7 @@ from .manifest_readings import Readings, points_of
 from .manifest_rows import Source, name_of, parts
 from .manifest_tables import TABLES, Length, PointsManifest, PosesManifest, Recorded, base_transform
 from .outputs import as_path
-from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
+from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches, matching
 from .reading_sets import other_readings, with_deviations
 from .toml import read_toml
 from .urdf_robots import joint_names, link_numbers
@@ -400,13 +400,17 @@ def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:
 def _lengths(
     entries: Sequence[Length], fields: Sequence[dict[str, str]], sockets: Mapping[str, _Seated]
 ) -> list[ReferenceLength]:
-    """Reference lengths; one with fields in braces gives every combination that the sockets' files have."""
+    """Reference lengths; one with fields in braces gives every combination that the sockets' files have, or else every
+    pair of sockets with such names, as a column of groups gives them."""
     lengths = []
     for entry in entries:
         check_fields(entry.start)
         check_fields(entry.end)
         names = fields_of(entry.start) | fields_of(entry.end)
         choices = {tuple((name, values[name]) for name in sorted(names)) for values in fields if names <= values.keys()}
+        if not choices and fields_of(entry.end) <= fields_of(entry.start):
+            named = matching(entry.start, sockets)
+            choices = {tuple(sorted(values.items())) for values in named if fill(entry.end, values) in sockets}
         if not choices and names:
             raise InputError(
                 f"length from '{entry.start}' to '{entry.end}' uses a field that no [[socket]] has; use only fields "

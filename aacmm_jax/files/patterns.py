@@ -65,6 +65,12 @@ def fill(text: str, values: Mapping[str, str]) -> str:
     return _FIELD.sub(lambda field: values[field.group(1)], text)
 
 
+def matching(pattern: str, names: Iterable[str]) -> list[dict[str, str]]:
+    """The values of the fields for each name that the pattern matches as a whole, as in `matches`."""
+    expression, fields = re.compile(_expression(pattern, _WORD)), list(dict.fromkeys(_FIELD.findall(pattern)))
+    return [dict(zip(fields, found.groups(), strict=True)) for name in names if (found := expression.fullmatch(name))]
+
+
 def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dict[str, str]]:
     """The values of the fields for each file below ``folder`` that the pattern matches, in the order of the paths.
 
