@@ -52,7 +52,6 @@ html_search_scorer = str(HERE / "search_scorer.js")
 pygments_dark_style = "github-dark"
 copybutton_prompt_text = "$ "  # of console blocks the commands are copied, and not what they print
 copybutton_line_continuation_character = "\\"
-copybutton_exclude = ".linenos, .gp"
 html_copy_source = False
 html_show_search_summary = False  # would be fetched, which a page on a disk may not do
 toc_object_entries = False
