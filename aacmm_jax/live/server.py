@@ -28,7 +28,7 @@ from ..core.errors import InputError, require
 _FILES = {
     "/": ("index.html", "text/html"),
     "/page.js": ("page.js", "text/javascript"),
-    "/view.js": ("view.js", "text/javascript"),
+    "/view.js": ("../../plot/view.js", "text/javascript"),
     "/style.css": ("style.css", "text/css"),
 }
 # What the page may ask for, with its fields; each is a method of the session.
