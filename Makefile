@@ -11,6 +11,7 @@
 # make test-lowest  the same with the lowest
 # make package      the source distribution and the wheel, installed and used in another folder: the core, and everything
 # make package-matrix  the same with each extra, on the oldest Python allowed and the newest one found
+# make release VERSION=0.2.0    everything that a release consists of, into dist/0.2.0; publishes nothing (.ci/release)
 # make audit        known vulnerabilities of the environment; skipped where their service cannot be reached
 # make bench        identifications a second, against every contender that is installed
 # make reproduce    Cheng et al. 2018, recomputed and checked against benchmarks/cheng2018/REPRODUCTION.md (1.5 minutes
@@ -41,7 +42,7 @@ SUMMARY := sed '/^Warning/,$$d'
 OTHER_ROUNDING := OPENBLAS_CORETYPE=Nehalem XLA_FLAGS=--xla_cpu_max_isa=SSE4_2
 
 .PHONY: demo test test-slow test-rounding test-exhaustive test-newest install-newest run-newest test-lowest check package \
-	package-matrix audit bench peers docs reproduce clean
+	package-matrix release audit bench peers docs reproduce clean
 
 demo: .venv/.run
 	$(BIN)/aacmm demo aacmm-demo
@@ -96,8 +97,8 @@ test-lowest:
 	$(OPTIMISED) .venv-lowest/bin/python $(PYTEST) -W ignore::DeprecationWarning $(SELECTION)
 
 check: .venv/.dev
-	$(BIN)/ruff check . .ci/try_package .ci/readme_commands
-	$(BIN)/ruff format --check . .ci/try_package .ci/readme_commands
+	$(BIN)/ruff check . .ci/try_package .ci/readme_commands .ci/release
+	$(BIN)/ruff format --check . .ci/try_package .ci/readme_commands .ci/release
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports --no-cache
 
@@ -106,6 +107,9 @@ package:
 
 package-matrix:
 	$(PYTHON) .ci/try_package --matrix
+
+release: .venv/.docs
+	@$(BIN)/python .ci/release "$(VERSION)" $(DATE)
 
 # Known vulnerabilities of what the tests run on. Their service is asked over the network; without one, this is skipped.
 audit: .venv/.dev
@@ -154,5 +158,5 @@ benchmarks/peers/%/.venv/.done: benchmarks/peers/%/requirements.txt
 
 clean:
 	rm -rf .venv .venv-newest .venv-lowest aacmm-demo docs/_build docs/notebooks docs/reference/api
-	rm -f docs/reference/command_line.md
+	rm -rf docs/reference/command_line.md docs/reference/gallery*
 	git clean -qfX docs/reference/files

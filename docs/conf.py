@@ -24,6 +24,7 @@ html_title = "aacmm_jax"
 
 extensions = [
     "myst_nb",
+    "sphinx_copybutton",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "mathml",
@@ -32,6 +33,9 @@ extensions = [
     "signatures",
     "command_pages",
     "file_pages",
+    "gallery",
+    "accessible",
+    "llms",
 ]
 exclude_patterns = ["_build", "notebooks/README.md"]
 nitpicky = True
@@ -40,6 +44,13 @@ html_theme = "furo"
 html_math_renderer = "mathml"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
+html_theme_options = {"light_logo": "logo.svg", "dark_logo": "logo.svg"}
+html_favicon = "static/logo.svg"
+html_search_scorer = str(HERE / "search_scorer.js")
+pygments_dark_style = "github-dark"
+copybutton_prompt_text = "$ "  # of console blocks the commands are copied, and not what they print
+copybutton_line_continuation_character = "\\"
+copybutton_exclude = ".linenos, .gp"
 html_copy_source = False
 html_show_search_summary = False  # would be fetched, which a page on a disk may not do
 toc_object_entries = False

@@ -50,9 +50,10 @@ def _axes(height: float = 3.0) -> Axes:
 
 
 def _save(axes: Axes, name: str) -> None:
-    assert isinstance(axes.figure, Figure)
+    figure = axes.get_figure(root=True)
+    assert figure is not None
     drawn = io.StringIO()
-    axes.figure.savefig(drawn, format="svg", metadata={"Date": None})
+    figure.savefig(drawn, format="svg", metadata={"Date": None})
     text = drawn.getvalue().replace(GREY, "var(--text)").replace(" <defs>", COLOURS + " <defs>", 1)
     (DOCS / f"{name}.svg").write_text(text, encoding="utf-8")
 
@@ -72,6 +73,47 @@ def _seen(arm: aj.Arm, capture: aj.Capture, geometry: Any = None) -> Any:
     observed = aj.evaluate(arm, capture, geometry=geometry).observed
     assert observed is not None
     return observed
+
+
+def before_and_after() -> None:
+    """A real Panda: tips of one held-out placement, and RMS errors of eight; D-H parameters alone are calibrated."""
+    recording = aj.files.read_manifest(EXAMPLES / "mukca" / "capture.toml")
+    arm, capture, bounds = recording.nominal.arm, recording.capture, recording.nominal.bounds()
+    places = dict.fromkeys(name.partition("/")[0] for name in capture.names)
+    calibrated = {
+        place: aj.calibrate(arm, capture.select(without=f"{place}/*"), bounds, method="joint").arm for place in places
+    }
+
+    def distances(by: Any, place: str) -> np.ndarray:
+        tips = [np.asarray(by.position(np.asarray(q))) for n, q in capture.sockets.items() if n.startswith(place + "/")]
+        return np.concatenate([tip - tip.mean(axis=0) for tip in tips])
+
+    figure = Figure(figsize=(7.2, 3.1), layout="constrained")
+    cloud, bars = figure.subplots(1, 2, width_ratios=(1, 1.7))
+    shown = "mid_left"
+    for label, by, colour, size in (("nominal", arm, ORANGE, 16), ("calibrated", calibrated[shown], BLUE, 9)):
+        at = distances(by, shown)
+        cloud.scatter(at[:, 0], at[:, 2], s=size, color=colour, label=label, alpha=0.85, linewidths=0)
+    cloud.set(xlabel="x [mm]", ylabel="z [mm]", aspect="equal", xlim=(-20, 10), ylim=(-15, 15))
+    cloud.set_title("Tips in two fixed sockets [mm]", fontsize=10)
+    cloud.legend(loc="lower center", handletextpad=0.1, borderpad=0, ncols=2, columnspacing=0.8, fontsize=9)
+    rms = np.array(
+        [
+            [np.sqrt((distances(by, place) ** 2).sum(axis=1).mean()) for by in (arm, calibrated[place])]
+            for place in places
+        ]
+    )
+    print({place: tuple(row.round(3)) for place, row in zip(places, rms, strict=True)})
+    for column, (offset, colour) in enumerate(((-0.2, ORANGE), (0.2, BLUE))):
+        drawn = bars.bar(np.arange(len(places)) + offset, rms[:, column], 0.38, color=colour)
+        bars.bar_label(drawn, [f"{value:.1f}" if value > 1 else f"{value:.2f}" for value in rms[:, column]], fontsize=8)
+    bars.set_xticks(
+        np.arange(len(places)), [place.replace("_", "\n").replace("-", "\n") for place in places], fontsize=9
+    )
+    bars.set(yscale="log", ylim=(0.1, 30))
+    bars.set_title("RMS error in placements held out [mm]", fontsize=10)
+    bars.set_yticks((0.1, 1, 10), ("0.1", "1", "10"))
+    _save(cloud, "before_and_after")
 
 
 def scale() -> None:
@@ -186,7 +228,9 @@ def planned_poses() -> None:
 
 def main() -> None:
     """Draw those that are named."""
-    every = {draw.__name__: draw for draw in (method, scale, uncertainty, random_splits, planned_poses)}
+    every = {
+        draw.__name__: draw for draw in (before_and_after, method, scale, uncertainty, random_splits, planned_poses)
+    }
     with matplotlib.rc_context(STYLE):
         for name in sys.argv[1:] or every:
             every[name]()

@@ -234,6 +234,7 @@ def test_every_import_of_another_package_is_declared():
         *("backports", "compression"),  # comes with rosbags; of Python 3.14
         "pyarrow",  # the extra lerobot
         *("starlette", "uvicorn", "serial", "regex"),  # the extra live
+        "typst",  # the extra certificate
         "yaml",  # PyYAML
         *(each.split(">=")[0] for each in DEPENDENCIES),
     }

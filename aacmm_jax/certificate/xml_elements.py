@@ -19,7 +19,7 @@ from ..uncertainty.coverage import LEVEL
 
 DCC, SI, XSI = "https://ptb.de/dcc", "https://ptb.de/si", "http://www.w3.org/2001/XMLSchema-instance"
 MILLIMETRE, RADIAN, ONE, CELSIUS = r"\milli\metre", r"\radian", r"\one", r"\degreecelsius"
-_PREFIXES = {"dcc": DCC, "si": SI}
+PREFIXES = {"dcc": DCC, "si": SI}
 _LARGEST = 1e100  # no quantity is as large in any unit
 
 Child = Element | str | None | Iterable[Any]  # whose items are children, too
@@ -206,16 +206,22 @@ def parse_dcc(text: str) -> dict[tuple[str, ...], CertifiedValue]:
         >>> print(a_3.value, "mm, U =", a_3.expanded, "mm")
         -0.3224 mm, U = 0.0039 mm
     """
+    root = root_of(text)
+    values: dict[tuple[str, ...], CertifiedValue] = {}
+    for result in root.iterfind("dcc:measurementResults/dcc:measurementResult", PREFIXES):
+        _collect(result, (), values)
+    return values
+
+
+def root_of(text: str) -> Element:
+    """The root of a certificate's XML. Raises `InputError` as `parse_dcc` says."""
     try:
         root = ElementTree.fromstring(text, ElementTree.XMLParser(target=_NoDocumentType()))
     except (ElementTree.ParseError, UnicodeError) as error:
         raise InputError(f"the certificate is not valid XML: {error}; export the certificate again.") from error
     if root.tag != f"{{{DCC}}}digitalCalibrationCertificate":
         raise InputError(f"the XML is a '{root.tag}', not a digital calibration certificate; give a DCC.")
-    values: dict[tuple[str, ...], CertifiedValue] = {}
-    for result in root.iterfind("dcc:measurementResults/dcc:measurementResult", _PREFIXES):
-        _collect(result, (), values)
-    return values
+    return root
 
 
 class _NoDocumentType(ElementTree.TreeBuilder):
@@ -224,16 +230,16 @@ class _NoDocumentType(ElementTree.TreeBuilder):
 
 
 def _collect(element: Element, path: tuple[str, ...], values: dict[tuple[str, ...], CertifiedValue]) -> None:
-    name, real = element.find("dcc:name/dcc:content", _PREFIXES), element.find("si:real", _PREFIXES)
+    name, real = element.find("dcc:name/dcc:content", PREFIXES), element.find("si:real", PREFIXES)
     path = path if name is None else (*path, name.text or "")
     if real is not None:
         stated = "si:measurementUncertaintyUnivariate/si:expandedMU/si:valueExpandedMU"
-        expanded = real.findtext(stated, None, _PREFIXES)
-        value = _number(real.findtext("si:value", "", _PREFIXES), "value", path)
+        expanded = real.findtext(stated, None, PREFIXES)
+        value = _number(real.findtext("si:value", "", PREFIXES), "value", path)
         u = None if expanded is None else _number(expanded, "expanded uncertainty", path)
-        values[path] = CertifiedValue(value, real.findtext("si:unit", "", _PREFIXES), u)
+        values[path] = CertifiedValue(value, real.findtext("si:unit", "", PREFIXES), u)
     for tag in ("results", "result", "data", "list", "quantity"):
-        for child in element.iterfind(f"dcc:{tag}", _PREFIXES):
+        for child in element.iterfind(f"dcc:{tag}", PREFIXES):
             _collect(child, path, values)
 
 

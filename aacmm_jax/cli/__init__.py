@@ -18,6 +18,7 @@ _FAMILIES = (
     "capture_commands",
     "calibration_commands",
     "result_commands",
+    "certificate_command",
     "controller_commands",
     "study_commands",
     "plan_commands",

@@ -11,11 +11,12 @@ import typer
 from .. import files, kinematics, summaries
 from ..core.errors import InputError
 from ..core.text import printable, shorten
-from ..files.inputs import InputFile, fingerprint
+from ..files.inputs import InputFile
 from ..files.outputs import check_kept, together, write_text
 from . import options
 from .app import command, show_summary, warn_of_unusable
 from .arm_command import first_frame
+from .certificate_command import dcc_of
 from .chains import named_chain, one_chain_of
 from .commanded import at_temperature, in_first_frame
 from .options import argument, flag, names_option, numbers_option, option, output
@@ -104,11 +105,7 @@ def export(
     ),
     output: Path | None = output("File to write. Default: standard output.", "FILE", None),
     about: Path | None = options.ABOUT,
-    evaluation: Path | None = option(
-        "Evaluation of this calibration, written by aacmm evaluate -o; its acceptance tests are added to the "
-        "certificate (--format dcc).",
-        "FILE.h5",
-    ),
+    evaluation: Path | None = options.EVALUATION,
     force: bool = flag("--force", "Export a calibration that is not usable all the same."),
 ) -> None:
     """Write a calibration for other programs or controllers."""
@@ -145,7 +142,7 @@ def export(
             )
         warn_of_unusable(calibration, record, force or which in ("nominal", "true"))
         if written_as == "dcc":
-            text = _certificate(read, record, about, evaluation)
+            text = dcc_of(read, record, about, evaluation)
         elif written_as == "table":
             text = files.dh_table(
                 specification.arm,
@@ -274,33 +271,6 @@ def _urdf(record: Any, specification: Any, form: str) -> tuple[str, list[str]]:
         "Left unchanged as far as possible, because measurements of the tip do not determine them: the base, and the "
         "position of each frame along its joint axis and its angle about this axis.",
     ]
-
-
-def _certificate(calibration: InputFile, record: Any, about: Path | None, evaluation: Path | None) -> str:
-    """The text of a certificate, with the acceptance tests of an evaluation where one is named."""
-    from ..acceptance.record import EvaluationRecord
-    from ..certificate import dcc_xml
-    from ..files.hdf5 import read_tables
-
-    made = read_tables(calibration, ("calibration",)).attributes
-    sources = [fingerprint(calibration), *record.recording.sources]
-    tested = None
-    if evaluation is not None:
-        tested = files.load_evaluation(read := InputFile(evaluation))
-        if not isinstance(tested, EvaluationRecord):
-            raise InputError(
-                f"{evaluation} is an evaluation of recorded points; name an evaluation of this calibration on a "
-                "capture."
-            )
-        sources += [fingerprint(read), *tested.recording.sources]
-    return dcc_xml(
-        record,
-        files.AdministrativeData() if about is None else files.read_administrative_data(about),
-        created=made["created"],
-        sources=list(dict.fromkeys(sources)),
-        evaluation=tested,
-        command=made["command"],
-    )
 
 
 @command(

@@ -52,6 +52,10 @@ NOMINAL_ARM = argument(
     "ARM",
 )
 ABOUT = option("Administrative data of a certificate: laboratory, customer, item, persons, dates.", "FILE.toml")
+EVALUATION = option(
+    "Evaluation of this calibration, written by aacmm evaluate -o; its acceptance tests are added to the certificate.",
+    "FILE.h5",
+)
 BASE_LINK = option("Fixed base link of the arm, of a URDF or MJCF. Default: the root (MJCF: world).", "LINK", "--base")
 TIP_LINK = option(
     "Last link (MJCF: body or site) of the arm; repeat for a robot of several chains. Default: all links or bodies "

@@ -11,7 +11,7 @@ _COMPARED = 200  # characters of a word: comparing takes their square
 # By extra of pyproject.toml, the package whose presence says whether it is installed.
 _PACKAGES = {
     "plot": "matplotlib", "report": "jinja2", "data": "xarray", "dask": "distributed", "camera": "cv2",
-    "excel": "openpyxl", "ros": "rosbags", "lerobot": "pyarrow", "live": "starlette",
+    "excel": "openpyxl", "ros": "rosbags", "lerobot": "pyarrow", "live": "starlette", "certificate": "typst",
 }  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 from .administrative_data import AdministrativeData as AdministrativeData
 from .administrative_data import read_administrative_data as read_administrative_data
+from .administrative_data import read_logo as read_logo
 from .arm_tables import ArmNoise as ArmNoise
 from .arms import load_arm as load_arm
 from .arms import load_noise as load_noise

@@ -4,16 +4,19 @@ import datetime
 import itertools
 import os
 import re
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, FiniteFloat, model_validator
 
 from ..core.errors import InputError
+from .inputs import open_input
 from .toml import Strict, read_toml
 
 NOT_STATED = "not stated"
 NO_COUNTRY = "ZZ"  # reserved for users by ISO 3166-1: a certificate must have a country code, and none was given
 
+_LARGEST_LOGO, _MOST_PIXELS, _PNG = 1_000_000, 10_000_000, b"\x89PNG\r\n\x1a\n"  # bytes, pixels
 # All but the characters of XML 1.0, production 2.
 _NOT_IN_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -61,9 +64,11 @@ class Contact(Strict):
 
 
 class Laboratory(Contact):
-    """The calibration laboratory; ``code`` is what its accreditation body calls it."""
+    """The calibration laboratory; ``code`` is what its accreditation body calls it, ``logo`` a PNG or SVG file, whose
+    path starts at the folder of the TOML file."""
 
     code: Text | None = None
+    logo: Text | None = None
 
 
 class CalibratedItem(Strict):
@@ -165,6 +170,35 @@ def read_administrative_data(path: str | os.PathLike) -> AdministrativeData:
         Braunschweig
     """
     return read_toml(path, AdministrativeData)
+
+
+def read_logo(path: str | os.PathLike) -> bytes | None:
+    """Read the logo that a file of administrative data names, None where it names none.
+
+    `InputError` if it is not a PNG or SVG file of at most 1 MB and 10 million pixels.
+
+    Args:
+        path: The TOML file (`read_administrative_data`).
+
+    Example:
+        >>> from pathlib import Path
+        >>> _ = Path("laboratory.toml").write_text('laboratory = { name = "Metrology" }')
+        >>> print(aj.files.read_logo("laboratory.toml"))
+        None
+    """
+    named = read_administrative_data(path).laboratory.logo
+    if named is None:
+        return None
+    logo = Path(path).parent / named
+    with open_input(logo) as stream:
+        content = stream.read(_LARGEST_LOGO + 1)
+    png = content.startswith(_PNG)
+    if not (png or b"<svg" in content[:4096]) or len(content) > _LARGEST_LOGO:
+        raise InputError(f"{logo} is not a PNG or SVG file of at most 1 MB; give another file as laboratory.logo.")
+    width, height = (int.from_bytes(content[i : i + 4]) for i in (16, 20))
+    if png and width * height > _MOST_PIXELS:
+        raise InputError(f"{logo} has {width} x {height} pixels; give a logo of at most 10 million pixels.")
+    return content
 
 
 def check_conformity(

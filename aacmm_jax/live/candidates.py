@@ -6,11 +6,12 @@ nearest to the present readings comes next.
 """
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
@@ -27,7 +28,7 @@ from ..planning.kit_placement import Thing, candidates_of_kit, set_up
 from ..planning.motion import joint_weights
 from ..planning.placement import LEAST_POSES
 from ..planning.problem import DesignProblem, PlanOptions
-from .places import Setup, by_thing, label_of
+from .places import Setup, TakenPose, by_thing, label_of
 
 TEN = 10  # poses that a prediction is for
 _STARTS, _OF_CAMERAS = 2000, 600  # random configurations in all things; with images, each of which has many rows
@@ -148,16 +149,25 @@ class Search:
         """Of the lengths over the volume, mm^2."""
         return np.sum(self.problem.lengths @ covariance * self.problem.lengths, axis=1)
 
+    def lacking(self, taken: Sequence[TakenPose]) -> Bool[np.ndarray, " s"]:
+        """Which places have fewer poses than are wanted there; all of them, where none that can be reached has."""
+        counts = Counter(pose.place for pose in taken)
+        lacks = np.array([counts[place.name] < place.wanted for place in self.setup.places])
+        lacks &= np.isin(np.arange(len(lacks)), self.pool().place)
+        return lacks if lacks.any() else ~lacks
+
     def ahead(
-        self, known: Candidates, ahead: Sequence[int], least: Int[np.ndarray, " s"], target: float | None
-    ) -> list[int]:
-        """What is left to be taken, planned again: as many poses as before, or some more or less where these do not
-        reach the target (a standard uncertainty, mm) or fewer do; at least so many in each place."""
-        random, count = self.problem.region.random, len(known.rows)
-        tried = np.unique([*ahead, *random.choice(count, min(_SEARCHED, count), replace=False)]).astype(int)
+        self, known: Candidates, ahead: Sequence[int], least: Int[np.ndarray, " s"], target: float | None,
+        lacking: Bool[np.ndarray, " s"],
+    ) -> list[int]:  # fmt: skip
+        """What is left to be taken, planned again in the places that lack poses: as many poses as before, or some more
+        or less where these do not reach the target (a standard uncertainty, mm) or fewer do; at least so many in each
+        place."""
+        random, rows, count = self.problem.region.random, np.flatnonzero(lacking[known.owner]), len(ahead)
+        ahead = [row for row in ahead if lacking[known.owner[row]]]
+        tried = np.unique([*ahead, *random.choice(rows, min(_SEARCHED, len(rows)), replace=False)]).astype(int)
         part = known._replace(rows=known.rows[tried], owner=known.owner[tried])
-        chosen = np.searchsorted(tried, ahead).tolist()
-        chosen = self.chosen(part, max(len(chosen), 1), chosen, least, sweeps=1)
+        chosen = self.chosen(part, max(count, 1), np.searchsorted(tried, ahead).tolist(), least * lacking, sweeps=1)
 
         def u(rows: Sequence[int]) -> float:
             return self.u(part.information(part.rows[list(rows)]))

@@ -156,8 +156,8 @@ class Guide:
         options |= {"prior": self._prior, "replace_noise": False, "max_steps": _STEPS}
         if capture.lengths or fixes_scale(capture):
             result = calibrate(problem.arm, capture, bounds, **options, shared_errors=False, undetermined="ignore")
-        else:  # the prior holds the scale
-            result = identify(problem.arm, capture, bounds, **options, hold=None)
+        else:  # the longest link is held: a prior would let a smaller arm, with smaller residuals, win in time
+            result = identify(problem.arm, capture, bounds, **options)
         vector = np.asarray(result.parameters)
         self._start = vector if np.all(np.isfinite(vector)) else None
         arm = to_numpy(result.arm)
@@ -191,7 +191,7 @@ class Guide:
         counts = np.array([sum(pose.place == place.name for pose in used) for place in self.setup.places])
         found = progress(
             self.search, solution.known, solution.taken, solution.scale, self._ahead,
-            np.maximum(LEAST_POSES - counts, 0), self.target,
+            np.maximum(LEAST_POSES - counts, 0), self.target, self.search.lacking(self._taken),
         )  # fmt: skip
         self._ahead = found.ahead
         by_number = solution.residuals()

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..core.text import pluralise
 from ..planning.designs import Candidates, covariance_of
@@ -32,7 +32,7 @@ class Progress(NamedTuple):
 
 def progress(
     search: Search, known: Candidates, taken: Float[np.ndarray, "P P"], scale: float, ahead: Sequence[int],
-    least: Int[np.ndarray, " s"], target: float | None,
+    least: Int[np.ndarray, " s"], target: float | None, lacking: Bool[np.ndarray, " s"],
 ) -> Progress:  # fmt: skip
     """How far a capture is.
 
@@ -44,12 +44,13 @@ def progress(
         ahead: The poses that were planned before.
         least: Poses that each place still needs.
         target: U that is asked for, mm.
+        lacking: The places in which poses are planned.
     """
     u = scale * search.u(known.base)
     floor = scale * search.u(known.base + _ENDLESS * taken)
     met, determined = search.scaled and target is not None and u <= target, u < _UNKNOWN * scale
     aim = target / scale if target is not None and determined and floor < target and not met else None
-    planned = search.ahead(known, ahead, least, aim)
+    planned = search.ahead(known, ahead, least, aim, lacking)
     after = scale * search.u(search.ten(known, planned))
     if not determined:
         limits = f"These poses do not determine lengths yet; {_least_known(search, known)}"

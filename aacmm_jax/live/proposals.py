@@ -70,15 +70,18 @@ class Proposals:
 
     def best(self, ahead: Sequence[int], place: str | None) -> NextPose | None:
         """Of the planned candidates the one that is worth most for its effort and that the joints can move to without a
-        collision, or of all candidates, where none is left; in ``place``, where that is given."""
+        collision, or of all candidates, where none is left; in ``place``, where that is given, else in the places that
+        lack poses, and in others only where there is no other way."""
         owner, names = self.known.owner, [place.name for place in self.search.setup.places]
-        for rows in (np.array([*ahead, *self._in_needy_things()], dtype=int), np.arange(len(self.pool.q))):
-            inside = rows if place is None else rows[owner[rows] == names.index(place)]
-            inside = np.array([i for i in inside if not self._is_old(names[owner[i]], self.pool.q[i])], dtype=int)
-            if len(rows) == len(self.pool.q) and len(inside):  # of all of them those that are worth most
-                part = self.known._replace(rows=self.known.rows[inside], owner=owner[inside])
-                inside = inside[self.search.chosen(part, min(_MOVES, len(inside)))]
-            for row in self._in_order(inside, ahead):
+        inside = self.search.lacking(self.taken) if place is None else np.array([name == place for name in names])
+        planned, every = np.array([*ahead, *self._in_needy_things()], dtype=int), np.arange(len(self.pool.q))
+        choices = [(planned[inside[owner[planned]]], False), (every[inside[owner]], True), (every, True)]
+        for rows, unplanned in choices if place is None else choices[:2]:
+            rows = np.array([i for i in rows if not self._is_old(names[owner[i]], self.pool.q[i])], dtype=int)
+            if unplanned and len(rows):  # of all of them those that are worth most
+                part = self.known._replace(rows=self.known.rows[rows], owner=owner[rows])
+                rows = rows[self.search.chosen(part, min(_MOVES, len(rows)))]
+            for row in self._in_order(rows, ahead):
                 why = gained(self.search.problem, self.known, row)
                 if (proposed := self._proposed(names[owner[row]], self.pool.q[row], why)) is not None:
                     return proposed

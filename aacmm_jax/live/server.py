@@ -9,9 +9,7 @@ import asyncio
 import contextlib
 import hmac
 import ipaddress
-import json
 import logging
-import math
 import os
 import re
 import secrets
@@ -24,36 +22,13 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from ..core.errors import InputError, require
+from .messages import Allowance, action_of, as_json
 
 _FILES = {
     "/": ("index.html", "text/html"),
     "/page.js": ("page.js", "text/javascript"),
     "/view.js": ("../../plot/view.js", "text/javascript"),
     "/style.css": ("style.css", "text/css"),
-}
-# What the page may ask for, with its fields; each is a method of the session.
-_ACTIONS: dict[str, dict[str, type]] = {
-    "take": {},
-    "undo": {},
-    "skip": {},
-    "exclude": {"pose": int, "excluded": bool},
-    "mark": {"text": str},
-    "temperature": {"celsius": float},
-    "auto": {"on": bool},
-    "place": {"name": str},
-    "finish": {"calibrate": bool},
-}
-_KINDS = {
-    int: "number of a pose",
-    float: "usable number",
-    str: "text of at most 200 printable characters",
-    bool: "choice of true or false",
-}
-_USABLE: dict[type, Callable[[Any], bool]] = {
-    int: lambda value: 0 <= value < 2**31,
-    float: lambda value: abs(value) < 2**31,
-    str: lambda value: len(value) <= 200 and value.isprintable(),
-    bool: lambda value: True,
 }
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -64,9 +39,15 @@ _HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
+# A report has its own scripts and styles, and no part in the page: it runs without an origin.
+_OF_REPORT = {
+    "Content-Security-Policy": "sandbox allow-scripts allow-downloads allow-modals; default-src 'none'; "
+    "script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; font-src data:",
+    "Cross-Origin-Opener-Policy": "unsafe-none",  # with another one a browser shows nothing that runs without an origin
+}
+_TICKET = 60.0  # s for which the address of a report holds, once
 _FRAME, _SILENCE = 1 / 30, 1.0  # s: between two looks at the session; after which a line comes in any case
 _BODY, _HEAD = 4096, 16_384  # bytes of a request, and of its head
-_A_SECOND, _BURST = 20.0, 40.0  # actions
 _CONNECTIONS, _STREAMS, _IDLE = 128, 24, 15.0  # at once; s without a request after which a connection is closed
 _SHORTEST_TOKEN = 16  # characters: guessing at 10,000 a second takes longer than a session
 
@@ -77,6 +58,10 @@ class LiveSession(Protocol):
 
     def state(self, since: int | None = None) -> dict[str, Any]:
         """Everything, or what changes all the time where nothing else has changed since a version."""
+        ...
+
+    def report(self) -> Path | None:
+        """The report to be shown, if there is one."""
         ...
 
 
@@ -177,7 +162,7 @@ def application(session: LiveSession, token: str, hosts: set[str] | None) -> Cal
     from starlette.responses import JSONResponse, Response, StreamingResponse
     from starlette.routing import Route
 
-    allowance, streams = _Allowance(), 0
+    allowance, streams, tickets = Allowance(), 0, dict[str, float]()  # until when each ticket holds
 
     def refused(status: int, message: str) -> Response:
         return JSONResponse({"message": message}, status)
@@ -196,7 +181,7 @@ def application(session: LiveSession, token: str, hosts: set[str] | None) -> Cal
         return checked
 
     async def state(request: Request) -> Response:
-        return Response(_json(await run_in_threadpool(session.state)), media_type="application/json")
+        return Response(as_json(await run_in_threadpool(session.state)), media_type="application/json")
 
     async def stream(request: Request) -> Response:
         if streams >= _STREAMS:
@@ -210,7 +195,7 @@ def application(session: LiveSession, token: str, hosts: set[str] | None) -> Cal
             version, last, sent, due = None, b"", 0.0, time.monotonic()
             while True:
                 now = await run_in_threadpool(session.state, version)
-                version, line = now.get("version"), _json(now) + b"\n"
+                version, line = now.get("version"), as_json(now) + b"\n"
                 if line != last or time.monotonic() - sent > _SILENCE:
                     yield line
                     last, sent = line, time.monotonic()
@@ -234,7 +219,7 @@ def application(session: LiveSession, token: str, hosts: set[str] | None) -> Cal
         except TimeoutError:
             return refused(408, "The request did not end.")
         try:
-            action, fields = _action(body)
+            action, fields = action_of(body)
             await run_in_threadpool(getattr(session, action), **fields)
         except InputError as error:
             return refused(400, str(error))
@@ -242,6 +227,23 @@ def application(session: LiveSession, token: str, hosts: set[str] | None) -> Cal
             logging.getLogger(__name__).exception("an action of the page failed")
             return refused(500, f"It failed: {type(error).__name__}.")
         return JSONResponse({})
+
+    async def ticket(request: Request) -> Response:
+        """An address for a new tab, which sends no header: it holds once."""
+        if not allowance.take():
+            return refused(429, "Too many actions in a second.")
+        if session.report() is None:
+            return refused(404, "There is no report yet; finish, and calibrate.")
+        for name in [name for name, until in tickets.items() if until < time.monotonic()]:
+            del tickets[name]
+        tickets[name := secrets.token_urlsafe(24)] = time.monotonic() + _TICKET
+        return JSONResponse({"path": f"report/{name}"})
+
+    async def report(request: Request) -> Response:
+        path = session.report()
+        if tickets.pop(request.path_params["ticket"], 0.0) < time.monotonic() or path is None:
+            return refused(403, "This address of the report holds no more; open it from the page again.")
+        return Response(await run_in_threadpool(path.read_bytes), media_type="text/html", headers=_OF_REPORT)
 
     async def static(request: Request) -> Response:
         content, kind = files[request.url.path]
@@ -251,13 +253,16 @@ def application(session: LiveSession, token: str, hosts: set[str] | None) -> Cal
     files = {path: ((folder / name).read_bytes(), kind) for path, (name, kind) in _FILES.items()}
     routes = [Route(path, static) for path in files]
     routes += [Route("/state", guarded(state)), Route("/stream", guarded(stream))]
-    routes += [Route("/do", guarded(do), methods=["POST"])]
+    routes += [Route("/do", guarded(do), methods=["POST"]), Route("/ticket", guarded(ticket), methods=["POST"])]
+    routes += [Route("/report/{ticket}", report)]
     app = Starlette(routes=routes)
 
     async def called_by_name(scope: Any, receive: Any, send: Any) -> None:
         async def with_headers(message: Any) -> None:
             if message["type"] == "http.response.start":
-                message["headers"] += [(key.lower().encode(), value.encode()) for key, value in _HEADERS.items()]
+                own = {key for key, _ in message["headers"]}
+                usual = ((key.lower().encode(), value.encode()) for key, value in _HEADERS.items())
+                message["headers"] += [(key, value) for key, value in usual if key not in own]
             await send(message)
 
         host = dict(scope["headers"]).get(b"host", b"").decode("latin-1").lower()
@@ -266,58 +271,6 @@ def application(session: LiveSession, token: str, hosts: set[str] | None) -> Cal
         await answer(scope, receive, with_headers)
 
     return called_by_name
-
-
-class _Allowance:
-    """Actions that may still be done: so many a second, and some saved up."""
-
-    def __init__(self) -> None:
-        self.left, self.at = _BURST, time.monotonic()
-
-    def take(self) -> bool:
-        now = time.monotonic()
-        self.left, self.at = min(_BURST, self.left + (now - self.at) * _A_SECOND), now
-        if self.left < 1:
-            return False
-        self.left -= 1
-        return True
-
-
-def _action(body: bytes) -> tuple[str, dict[str, Any]]:
-    """Name and fields of an action; everything that is not in the table is refused."""
-    try:
-        given = json.loads(body)
-    except (ValueError, RecursionError):
-        raise InputError("an action must be JSON") from None
-    name = str(given.get("action")) if isinstance(given, dict) else ""
-    if (wanted := _ACTIONS.get(name)) is None:
-        raise InputError(f"an action must be one of {', '.join(_ACTIONS)}")
-    fields = {key: value for key, value in given.items() if key != "action"}
-    if fields.keys() != wanted.keys():
-        raise InputError(f"{name} takes {', '.join(wanted) or 'no fields'}")
-    for key, kind in wanted.items():
-        if kind is float and type(fields[key]) is int:
-            fields[key] = float(min(fields[key], 2**31))
-        if type(fields[key]) is not kind or not _USABLE[kind](fields[key]):
-            raise InputError(f"{key} of {name} is not a {_KINDS[kind]}")
-    return name, fields
-
-
-def _json(state: Any) -> bytes:
-    """JSON, in which a number that is not finite is null: a browser reads no other."""
-
-    def finite(value: Any) -> Any:
-        if isinstance(value, float):
-            return value if math.isfinite(value) else None
-        if isinstance(value, dict):
-            return {key: finite(item) for key, item in value.items()}
-        return [finite(item) for item in value] if isinstance(value, list | tuple) else value
-
-    try:
-        text = json.dumps(state, allow_nan=False, separators=(",", ":"))
-    except ValueError:
-        text = json.dumps(finite(state), allow_nan=False, separators=(",", ":"))
-    return text.encode()
 
 
 def _protocol() -> type:

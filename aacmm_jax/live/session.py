@@ -7,8 +7,7 @@ import atexit
 import os
 import threading
 import time
-from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,22 +16,21 @@ from jaxtyping import Float
 
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
-from ..kinematics.arm import Arm, by_joint
+from ..kinematics.arm import Arm
 from . import guidance as guiding
 from .captured import Captured, Whereabouts
 from .devices import open_device
 from .devices.device import AbstractDevice, check_joints
 from .journal import Journal, journal_of
 from .places import COLUMNS, Place, Setup, TakenPose
-from .samples import BUTTONS, Sample, lines_of, mean_measured
+from .readings import Readings
+from .samples import Sample, lines_of, mean_measured
 from .shown import headline, links_of, shown_readings, state_of
-from .sides import Sides, check_nothing_holds, from_both_sides, sides_of
-from .stillness import Rest, Stillness
+from .sides import check_nothing_holds, from_both_sides, sides_of
+from .stillness import Rest
 from .written import fitting, written
 
 _LOOK_EVERY = 0.1  # s of rest
-_MOST_MEASURED = 500
-_APART = 0.02  # rad, or m of prismatic joints: least change of a joint between two poses that are taken by themselves
 _LONGEST_TEXT = 200
 _LONGEST_END = 60.0  # s
 
@@ -95,17 +93,11 @@ class Session:
         self._message = ""
         self._again: tuple[int | None, float] = None, np.inf  # pose that is to be taken again, and when that was said
         self._shown: tuple[int, dict[str, Any]] = -1, {}  # the version, and what is seen of it
-        self._q: Float[np.ndarray, " n"] | None = None
-        self._columns: dict[str, float] = {}
-        self._measured: list[Mapping[str, Any]] = []  # what instruments have seen since the arm is at rest
-        self._sample_times: deque[float] = deque(maxlen=50)
-        self._sample_time = -np.inf
+        self._readings = Readings(self._arm)
         self._taken_until = -np.inf  # time of the device up to which rest has been used
         self._looked_at = -np.inf  # and when it was last looked at
         self._taken_q: Float[np.ndarray, " n"] | None = None
-        self._stillness, self._sides = Stillness(self._arm.joints), Sides(self._arm)
         self._both_sides, self._taken_sides = both_sides, np.zeros(self._arm.joints)
-        self._pressed: frozenset[str] = frozenset()  # buttons of the arm
         self._journal, self._closed = Journal(journal_of(self.path)), False
         self._devices: list[AbstractDevice] = []
         self._threads: list[threading.Thread] = []
@@ -133,7 +125,7 @@ class Session:
     def take(self) -> int:
         """Take the present pose; its number. `InputError` where the arm moves, or it is not clear where the tip is."""
         with self._lock:
-            rest = self._stillness.rest
+            rest = self._readings.rest
             if rest is None:
                 raise InputError("the arm is moving; hold it still, then take the pose.")
             place = self._place_at(self._tip_of(rest.q))
@@ -205,6 +197,12 @@ class Session:
             self._record({"event": "finished", "paths": paths})
         return paths
 
+    def report(self) -> Path | None:
+        """The report that was written last."""
+        with self._lock:
+            found = Path(self._captured.paths[-1]) if self._captured.paths else None
+        return found if found is not None and found.suffix == ".html" and found.is_file() else None
+
     def close(self) -> None:
         """Stop; everything is on disk already."""
         self._stop.set()
@@ -256,17 +254,16 @@ class Session:
             return live | self._shown[1]
 
     def _live(self) -> dict[str, Any]:
-        rest, q, times = self._stillness.rest, self._q, self._sample_times
+        rest, q = self._readings.rest, self._readings.q
         links = None if q is None else links_of(self._where.arm, q)
         place = None if links is None else self._place_at(np.array(links[-1]))
-        lasted = times[-1] - times[0] if times else 0.0
         return {
             "q": None if q is None else shown_readings(self._arm, q),
             "tip": links and links[-1],
             "links": links,
             "still": rest is not None,
             "since": None if rest is None else rest.until - rest.since,
-            "rate": (len(times) - 1) / lasted if lasted > 0 else 0.0,
+            "rate": self._readings.rate,
             "place": place and place.name,
             "devices": [device.state() for device in self._devices],
         }
@@ -300,15 +297,14 @@ class Session:
         """The place that the tip is in: the one that was said, else the one that its position says."""
         if self._forced is not None:
             return self.setup.place(self._forced)
-        return self._where.place_at(tip, bool(self._measured), self._next and self._next.place)
+        return self._where.place_at(tip, bool(self._readings.measured), self._next and self._next.place)
 
     def _tip_of(self, q: Float[np.ndarray, " n"]) -> Float[np.ndarray, " 3"]:
         return np.array(links_of(self._where.arm, q)[-1])
 
     def _take(self, rest: Rest, place: Place) -> int:
-        measured = mean_measured(self._measured) if place.is_free else {}
-        columns = {name: value for name, value in self._columns.items() if name not in BUTTONS}
-        columns = self._sides.columns() | columns  # what a device knows of its directions counts first
+        measured = mean_measured(self._readings.measured) if place.is_free else {}
+        columns = self._readings.beside()
         if self._captured.temperature is not None:
             columns[COLUMNS["thermometer"]] = self._captured.temperature
         number = self._captured.number + 1
@@ -343,22 +339,11 @@ class Session:
     def _add(self, samples: Iterable[Sample]) -> None:
         pressed: set[str] = set()
         for sample in samples:
-            self._columns |= sample.columns
-            if sample.measured:
-                self._measured = [*self._measured[-_MOST_MEASURED:], sample.measured]
-            now = frozenset(name for name in BUTTONS if self._columns.get(name))
-            pressed |= now - self._pressed
-            self._pressed = now
+            now_pressed, anew = self._readings.add(sample)
+            pressed |= now_pressed
+            if anew:
+                self._taken_until = self._looked_at = -np.inf
             if sample.q is not None:
-                self._q = sample.q
-                if sample.time < self._sample_time:  # the device's clock began anew
-                    self._stillness, self._taken_until, self._looked_at = Stillness(self._arm.joints), -np.inf, -np.inf
-                self._sample_time = sample.time
-                self._stillness.add(sample)
-                self._sides.add(sample.q)
-                if self._stillness.rest is None:
-                    self._measured = []
-                self._sample_times.append(sample.time)
                 self._take_by_itself()
         if "button" in pressed:
             self.take()
@@ -366,7 +351,7 @@ class Session:
             self.skip()
 
     def _take_by_itself(self) -> None:
-        rest = self._stillness.rest
+        rest = self._readings.rest
         if not self._auto or rest is None or self._busy or rest.since <= self._taken_until:
             return
         if self._looked_at <= rest.until < self._looked_at + _LOOK_EVERY:
@@ -374,10 +359,8 @@ class Session:
         self._looked_at = rest.until
         # A pose that is to be taken again is where it was, seated anew since that was said.
         if self._taken_q is not None and rest.since <= self._again[1]:
-            moved = np.abs(rest.q - self._taken_q) / np.array(by_joint(self._arm, 1.0, 1000.0))
-            if np.max(moved) < _APART and not (
-                self._both_sides and np.mean(self._sides.now == self._taken_sides) < 0.5
-            ):
+            other_side = self._both_sides and np.mean(self._readings.sides.now == self._taken_sides) < 0.5
+            if self._readings.is_near(rest, self._taken_q) and not other_side:
                 self._taken_until = rest.until  # also while it ends, with readings of the next motion in it
                 return
         place = self._place_at(self._tip_of(rest.q))
@@ -391,7 +374,8 @@ class Session:
                 continue
             self._wake.clear()
             with self._lock:
-                poses, q, forced, skipped = list(self._captured.poses), self._q, self._forced, list(self._skipped)
+                poses, skipped = list(self._captured.poses), list(self._skipped)
+                q, forced = self._readings.q, self._forced
             found, proposed, message = None, None, ""
             try:
                 guide = guiding.Guide(self.setup, self.target) if guide is None else guide
@@ -411,7 +395,7 @@ class Session:
                 self._next, self._message, self._planning = proposed, message, False
                 again = found.again.number if found is not None and found.again is not None else None
                 if again != self._again[0]:
-                    self._again = again, np.inf if again is None else self._sample_time
+                    self._again = again, np.inf if again is None else self._readings.time
                 self._changed()
                 if proposed is not None:
                     for device in self._devices:

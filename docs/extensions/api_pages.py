@@ -1,6 +1,7 @@
-"""The pages of the reference that are generated: one for each namespace; and the notebooks, linked where Sphinx looks.
+"""The pages of the reference that are generated: one for each subject; and the notebooks, linked where Sphinx looks.
 
-They are written to docs/reference/api when a build begins, and git ignores them.
+A name of ``aj`` itself is described with the subject whose folder it is written in. The pages are written to
+docs/reference/api when a build begins, and git ignores them.
 """
 
 import importlib
@@ -12,6 +13,7 @@ from class_fields import without_substitutions
 from public_names import PACKAGE, PublicName, namespaces, public_names
 
 DOCS = Path(__file__).resolve().parents[1]
+ROOT = PACKAGE.name
 
 
 def _link(name: str) -> str:
@@ -40,14 +42,24 @@ def _summary(item: PublicName) -> str:
     return without_substitutions(item.docstring.partition("\n\n")[0].replace("\n", " "))
 
 
+def subject(item: PublicName) -> str:
+    """The namespace on whose page a name is described."""
+    if item.namespace != ROOT:
+        return item.namespace
+    folder = ".".join((ROOT, *item.source.relative_to(PACKAGE).parts[:-1]))
+    return max((name for name in namespaces() if f"{folder}.".startswith(f"{name}.")), key=len)
+
+
 def page(namespace: str, names: list[PublicName]) -> str:
     """The reference of one namespace as reStructuredText."""
     module = importlib.import_module(namespace)
-    of_namespace = [item for item in names if item.namespace == namespace]
+    of_namespace = [item for item in names if subject(item) == namespace]
     others = [item for item in names if any(name.rpartition(".")[0] == namespace for name in item.also)]
     title = namespace.replace("aacmm_jax", "aj", 1)
     lines = [*_underlined(title, "="), inspect.getdoc(module) or "", ""]
-    if of_namespace:
+    if namespace == ROOT:
+        lines += ["| " + f"{_link(item.name)}: {_summary(item)}" for item in names if item.namespace == ROOT] + [""]
+    elif of_namespace:
         lines += ["| " + f"{_link(item.name)}: {_summary(item)}" for item in of_namespace] + [""]
     if others:
         lines += ["Here too: " + ", ".join(_link(item.name) for item in others) + ".", ""]

@@ -193,6 +193,7 @@ DESCRIPTIONS = {
     "certificate": "Number, dates and conditions.",
     "conformity": "A statement of conformity.",
     "code": "Code that the accreditation body gave to the laboratory.",
+    "logo": "Logo, a PNG or SVG file.",
     "street": "Street.",
     "postal_code": "Postal code.",
     "city": "City.",

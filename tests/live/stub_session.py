@@ -3,6 +3,7 @@
 import math
 import threading
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ class StubSession:
         ]  # fmt: skip
         self.poses: list[dict[str, Any]] = []
         self.auto_on, self.celsius, self.session, self.done, self.here = True, 20.0, 1, False, None
+        self.written: Path | None = None  # the report
         for _ in range(poses):
             self.take()
         self.asked.clear()
@@ -38,6 +40,9 @@ class StubSession:
     def now(self) -> np.ndarray:
         t = time.monotonic() - self.began
         return self.home + 0.3 * np.sin(0.7 * t + np.arange(self.arm.joints))
+
+    def report(self) -> Path | None:
+        return self.written
 
     def __getattr__(self, name: str) -> Any:
         if name not in ("mark", "temperature", "auto", "place", "finish", "undo", "exclude", "take", "skip"):

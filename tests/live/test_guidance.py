@@ -196,3 +196,37 @@ def test_what_nothing_measures_is_taken_as_exact() -> None:
     assert unseen
     assert all(name.startswith("probe_") for name in unseen)
     assert f"Nothing here measures {', '.join(unseen)}: U takes them as exact." in search.unreached.values()
+
+
+@pytest.mark.slow
+def test_poses_in_sockets_alone_do_not_shrink_the_arm() -> None:
+    # Residuals are smaller the smaller the arm is: a prior of 10 mm alone lost against 200 poses.
+    operator = Operator(Guide(setup()._replace(lengths=()), None), seed=3)
+    nominal = operator.guide.setup.specification.arm
+    longest = int(np.argmax(np.abs(nominal.d)))
+    random = np.random.default_rng(1)
+    pool = operator.guide.search.pool()
+    for row in random.permutation(len(pool.q))[:150]:
+        place = operator.guide.setup.places[pool.place[row]].name
+        operator.take(NextPose(place, pool.q[row], "", 0.0))
+    found = operator.guide.calibrated(operator.poses)
+    assert found is not None
+    assert float(found.arm.d[longest]) == pytest.approx(float(nominal.d[longest]), rel=0.01)
+
+
+@pytest.mark.slow
+def test_places_that_have_the_poses_that_are_wanted_wait_for_the_others() -> None:
+    operator, _ = run()
+    guide = Guide(setup(), 0.001)
+    found = guide.calibrated(operator.poses)
+    counts = {place: sum(pose.place == place for pose in operator.poses) for place in PLACES}
+    places = [place._replace(wanted=counts[place.name] + 3 * (place.name == "D")) for place in guide.setup.places]
+    guide = Guide(setup()._replace(places=tuple(places)), 0.001)
+    found = guide.calibrated(operator.poses)
+    assert found is not None
+    names = {guide.setup.places[guide.search.pool().place[row]].name for row in found.ahead}
+    asked = guide.next_pose(found, operator.poses[-1].q)
+    assert (names, asked and asked.place) == ({"D"}, "D")
+    chosen = guide.next_pose(found, operator.poses[-1].q, "A")
+    assert chosen is not None
+    assert chosen.place == "A"

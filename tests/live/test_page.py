@@ -154,6 +154,22 @@ def test_everybody_can_read_it(shown, width, scheme):
             assert [(rule["id"], rule["nodes"][0]["html"]) for rule in found] == []
 
 
+def test_a_click_opens_the_report_in_a_tab_without_an_origin(shown, tmp_path):
+    session = StubSession(poses=3)
+    with serving(session) as address:
+        page = shown(address)
+        assert not page.is_visible("#report")
+        session.written = tmp_path / "capture-report.html"
+        session.written.write_text("<title>A report</title><p id=p>no</p><script>p.textContent = origin</script>")
+        session.finish(calibrate=True)
+        with page.context.expect_page() as opened:
+            page.click("#report")
+        report = opened.value
+        report.wait_for_function("document.title === 'A report'")
+        assert report.text_content("#p") == "null"
+        assert page.said == []
+
+
 def test_what_a_device_says_is_text(shown):
     session = StubSession(poses=2, text=MARKUP)
     with serving(session) as address:

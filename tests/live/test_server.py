@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.live import server
+from aacmm_jax.live import messages, server
 
 from .stub_session import StubSession
 
@@ -72,11 +72,30 @@ FOREIGN = {
 
 @pytest.mark.parametrize(("headers", "status"), FOREIGN.values(), ids=FOREIGN)
 def test_who_is_not_the_page_sees_and_commands_nothing(served, headers, status):
-    for method, path in (("POST", "/do"), ("GET", "/state"), ("GET", "/stream")):
+    for method, path in (("POST", "/do"), ("GET", "/state"), ("GET", "/stream"), ("POST", "/ticket")):
         answered, body = served.ask(method, path, **headers)
         assert answered == status
         assert list(json.loads(body)) == ["message"]
     assert served.session.asked == []
+
+
+def test_a_ticket_shows_the_report_once_and_gives_it_no_origin(served, tmp_path, monkeypatch):
+    assert served.ask("POST", "/ticket")[0] == 404
+    served.session.written = tmp_path / "capture-calibration.html"
+    served.session.written.write_text("<p>A report</p>")
+    addresses = []
+    for _ in range(2):
+        status, answer = served.ask("POST", "/ticket")
+        assert status == 200
+        addresses.append("/" + json.loads(answer)["path"])
+    for address in addresses:  # a tab sends neither a token nor an origin
+        assert served.ask("GET", address, X_Token=None, Origin=None) == (200, b"<p>A report</p>")
+        assert served.ask("GET", address)[0] == 403
+    for address in ("/report/", "/report/x", "/report/../capture.h5", "/report/" + served.token):
+        assert served.ask("GET", address)[0] in (403, 404)
+    monkeypatch.setattr(server, "_TICKET", -1.0)
+    late = json.loads(served.ask("POST", "/ticket")[1])["path"]
+    assert served.ask("GET", f"/{late}")[0] == 403
 
 
 ODD = {
@@ -151,7 +170,7 @@ def test_every_action_reaches_the_session_as_it_was_sent(served):
             served.session.asked.clear()
         assert served.ask(body=json.dumps({"action": action, **fields}).encode()) == (200, b"{}")
         assert served.session.asked.pop() == (action, fields)
-    assert set(ACTIONS) == set(server._ACTIONS)
+    assert set(ACTIONS) == set(messages._ACTIONS)
 
 
 def test_what_the_session_refuses_or_fails_at_is_said_and_nothing_ends(served, monkeypatch, caplog):
@@ -162,7 +181,7 @@ def test_what_the_session_refuses_or_fails_at_is_said_and_nothing_ends(served, m
 
 
 def test_too_many_actions_in_a_second_are_refused(served):
-    answers = [served.ask()[0] for _ in range(int(server._BURST) + 60)]
+    answers = [served.ask()[0] for _ in range(int(messages._BURST) + 60)]
     assert 429 in answers
     assert len(served.session.asked) == answers.count(200)
 
@@ -278,8 +297,8 @@ def hostile(rng: random.Random) -> tuple[bytes, dict[str, str | None]]:
 
 @pytest.mark.parametrize("count", [200, pytest.param(10_000, marks=pytest.mark.exhaustive)])
 def test_hostile_messages_are_not_obeyed_and_leave_nothing(served, monkeypatch, count):
-    monkeypatch.setattr(server, "_A_SECOND", 1e9)  # or most would be refused for their number alone
-    monkeypatch.setattr(server, "_BURST", 1e9)
+    monkeypatch.setattr(messages, "_A_SECOND", 1e9)  # or most would be refused for their number alone
+    monkeypatch.setattr(messages, "_BURST", 1e9)
     rng, size = random.Random(0), []
     for number in range(count):
         body, headers = hostile(rng)
@@ -295,7 +314,7 @@ def test_hostile_messages_are_not_obeyed_and_leave_nothing(served, monkeypatch, 
         else:  # it happened to be a right one
             assert not headers
             action, given = served.session.asked[-1]
-            assert {key: type(value) for key, value in given.items()} == server._ACTIONS[action]
+            assert {key: type(value) for key, value in given.items()} == messages._ACTIONS[action]
             assert all(value.isprintable() and len(value) <= 200 for value in given.values() if type(value) is str)
         served.session.asked.clear()
         if number in (count // 5, count - 2):

@@ -36,6 +36,15 @@ async function ask(action, fields = {}) {
   }
 }
 
+async function openReport() {
+  const tab = open("", "_blank"); // at once: later a browser would take it for an advertisement
+  const answer = await fetch("ticket", { method: "POST", headers: { "X-Token": token } }).catch(() => null);
+  const said = await answer?.json();
+  if (answer?.ok && tab) tab.location.replace(said.path);
+  else tab?.close();
+  put($("message"), answer?.ok ? "" : said?.message ?? "The session does not answer.");
+}
+
 function choose(question, choices, answer) {
   const dialog = $("ask"), box = $("choices");
   if (dialog.open) return;
@@ -110,6 +119,7 @@ $("thermometer").addEventListener("submit", (event) => {
 for (const button of document.querySelectorAll("[data-view]")) {
   button.addEventListener("click", () => view.look(...button.dataset.view.split(" ").map(Number)));
 }
+$("report").addEventListener("click", openReport);
 $("over").addEventListener("click", () => view.turnOver());
 
 function select(step) {
@@ -235,6 +245,7 @@ function everything() {
   for (const id of ["sentences", "paths"]) {
     $(id).replaceChildren(...(state[id] ?? []).map((text) => element("li", text)));
   }
+  $("report").hidden = !state.paths?.at(-1)?.endsWith(".html");
   $("results").hidden = !state.sentences?.length && !state.paths?.length;
   view.show({ places: state.places, poses: state.poses, next: next?.place ?? null,
     ghost: next?.links?.length ? { links: next.links } : null });

@@ -1,0 +1,80 @@
+"""Words of the printed certificate, one TOML file a language."""
+
+import os
+import re
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+from pydantic import AfterValidator
+
+from ...core.errors import InputError
+from ...files.administrative_data import NOT_STATED, Text
+from ...files.toml import Strict, read_toml
+
+_FOLDER = Path(__file__).parent
+_NAMED = re.compile(r"\{(\w+)\}")
+
+
+def _code(text: str) -> str:
+    if not re.fullmatch("[a-z]{2}", text):
+        raise ValueError(f"{text!r} is not a language code of ISO 639-1; give two small letters, for example fr.")
+    return text
+
+
+class _File(Strict):
+    code: Annotated[str, AfterValidator(_code)]
+    decimal: Text
+    labels: dict[str, Text]
+    sentences: dict[str, Text]
+    counts: dict[str, Text]
+    places: dict[str, Text]
+    verdicts: dict[str, Text]
+    rules: dict[str, Text]
+    terms: dict[str, Text]
+    metrics: dict[str, Text]
+
+
+_GROUPS = tuple(name for name in _File.model_fields if name not in ("code", "decimal"))
+_SUFFIXED = {"sentences": "{}_sentence", "places": "place_{}", "metrics": "metric_{}"}  # whose keys others have as well
+
+
+class Language(NamedTuple):
+    """The texts of a language by their keys; called with a key and what stands in braces, it is the text."""
+
+    code: str
+    decimal: str
+    texts: dict[str, str]
+
+    def __call__(self, key: str, **values: str) -> str:
+        """The text of a key, with values for the names in its braces."""
+        text = _NAMED.sub(lambda match: values.get(match[1], match[0]), self.texts[key])
+        return text.replace(" %", "\u00a0%")
+
+    def stated(self, text: str) -> str:
+        """A text, or that it is not stated, in this language."""
+        return self("not_stated") if text in ("", NOT_STATED) else text
+
+    def number(self, text: str) -> str:
+        """A number, or several, with this language's decimal sign and a proper minus."""
+        return text.replace(".", self.decimal).replace("-", "−")
+
+
+def language_of(named: str | os.PathLike) -> Language:
+    """A language that comes with the package ("en", "de"), or that of a TOML file. Raises `InputError`."""
+    shipped = sorted(path.stem for path in _FOLDER.glob("*.toml"))
+    path = _FOLDER / f"{named}.toml" if str(named) in shipped else Path(named)
+    if path.suffix != ".toml":
+        raise InputError(
+            f"'{named}' is not a language of the certificate; choose {' or '.join(shipped)}, or give a TOML file."
+        )
+    content, english = read_toml(path, _File), read_toml(_FOLDER / "en.toml", _File)
+    texts = {}
+    for group in _GROUPS:
+        given, wanted = getattr(content, group), getattr(english, group)
+        for key in (*wanted, *given):
+            if key not in given or key not in wanted:
+                raise InputError(f"{path}: [{group}] {'lacks' if key in wanted else 'has the unknown key'} {key!r}.")
+            if set(_NAMED.findall(given[key])) != set(_NAMED.findall(wanted[key])):
+                raise InputError(f"{path}: [{group}] {key!r} needs the same names in braces as {wanted[key]!r}.")
+            texts[_SUFFIXED.get(group, "{}").format(key)] = given[key]
+    return Language(content.code, content.decimal, texts)

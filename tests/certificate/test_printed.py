@@ -1,0 +1,178 @@
+"""The printed certificate: HTML and PDF say the same, and what they say is in the DCC that the PDF holds."""
+
+import contextlib
+import io
+import re
+import unicodedata
+import zlib
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.certificate import certificate_html, certificate_pdf, languages
+from tests.certificate import dcc_model
+from tests.certificate.conftest import KINDS
+from tests.refusals import assert_refused
+
+SVG = b'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 2 1"><rect width="2" height="1"/></svg>'
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return len(data).to_bytes(4) + kind + data + zlib.crc32(kind + data).to_bytes(4)
+
+
+_HEADER = (1).to_bytes(4) * 2 + bytes((8, 2, 0, 0, 0))  # one pixel, RGB
+PNG = b"\x89PNG\r\n\x1a\n" + b"".join(
+    _chunk(*part) for part in ((b"IHDR", _HEADER), (b"IDAT", zlib.compress(bytes(4))), (b"IEND", b""))
+)
+
+
+class Texts(HTMLParser):
+    """The texts of a page, without its style."""
+
+    def __init__(self, page: str):
+        super().__init__()
+        self.texts: list[str] = []
+        self.tags: set[str] = set()
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        self.hidden = tag in ("style", "title") or ("class", "screen") in attrs or (tag == "a" and self.hidden)
+
+    def handle_data(self, data):
+        if data.strip() and not self.hidden:
+            self.texts.append(data.strip())
+
+
+def squeezed(text: str) -> str:
+    """Without blanks, and with ligatures taken apart."""
+    return re.sub(r"\s", "", unicodedata.normalize("NFKC", text))
+
+
+@pytest.fixture(scope="module")
+def read():
+    pypdf = pytest.importorskip("pypdf")
+    return lambda pdf: pypdf.PdfReader(io.BytesIO(pdf))
+
+
+ORDINARY = [kind for kind in KINDS if kind != "hostile names"]
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
+@pytest.mark.parametrize("kind", ORDINARY)
+def test_html_and_pdf_say_the_same_on_two_numbered_pages(certificates, read, kind, language):
+    dcc = certificates[kind]
+    found = read(certificate_pdf(dcc, language=language, logo=SVG))
+    pages = [page.extract_text() for page in found.pages]
+    assert len(pages) == 2
+    html = Texts(certificate_html(dcc, language=language, logo=SVG)).texts
+    assert len(html) > 100
+    assert [text for text in html if squeezed(text) not in squeezed("".join(pages))] == []
+    number = re.search("<dcc:uniqueIdentifier>(.*)</dcc:uniqueIdentifier>", dcc)
+    assert number is not None
+    page = {"en": "Page {} of 2", "de": "Seite {} von 2"}[language]
+    for i, text in enumerate(pages, start=1):
+        assert number[1] in text
+        assert page.format(i) in text
+
+
+def test_the_dcc_comes_out_of_the_pdf_as_it_went_in(certificates, read):
+    """It is valid, and the PDF says that it is PDF/A-3, which may hold it."""
+    dcc = certificates["all stated"]
+    pdf = certificate_pdf(dcc, logo=PNG)
+    attached = read(pdf).attachments
+    assert list(attached) == ["dcc.xml"]
+    assert attached["dcc.xml"] == [dcc.encode()]
+    assert dcc_model.faults(attached["dcc.xml"][0].decode()) == []
+    assert b"<pdfaid:part>3</pdfaid:part>" in pdf
+    assert certificate_pdf(dcc, logo=PNG) == pdf
+
+
+@pytest.mark.parametrize("kind", ORDINARY)
+def test_every_printed_uncertainty_is_one_of_the_dcc(certificates, kind):
+    page = certificate_html(certificates[kind])
+    printed = re.findall(r"(−?[\d.]+) ± ([\d.]+)", page)
+    assert len(printed) > 5
+    stated = re.compile(
+        r"<si:value>([^<]*)</si:value>\s*<si:unit>[^<]*</si:unit>\s*<si:measurementUncertaintyUnivariate>\s*"
+        r"<si:expandedMU>\s*<si:valueExpandedMU>([^<]*)<"
+    )
+    assert {(value.replace("−", "-"), u) for value, u in printed} <= set(stated.findall(certificates[kind]))
+
+
+def test_what_a_laboratory_states_is_printed(certificates):
+    """Identification, conditions, tests with limit and decision; German with its decimal sign."""
+    page = certificate_html(certificates["all stated"], language="de")
+    texts = Texts(page).texts
+    for text in ("Längenlabor <b>&amp; Söhne</b>", "X'1", "0007", "c <7>", "K 17", "house rule 1", "2026-02-04"):
+        assert text in texts, text
+    assert "20,25\u00a0°C (u = 0,1\u00a0°C)" in texts
+    assert {"b", "script"}.isdisjoint(Texts(page).tags)
+    assert "Konformitätsaussage" in texts
+    assert "unentschieden (innerhalb der Grenze)" in texts
+
+
+def test_hostile_names_are_texts_in_both(certificates):
+    """In the PDF, or it says that no font has them."""
+    page = Texts(certificate_html(certificates["hostile names"]))
+    assert "script" not in page.tags
+    assert any("<script>alert" in text for text in page.texts)
+    with contextlib.suppress(aj.InputError):
+        assert certificate_pdf(certificates["hostile names"]).startswith(b"%PDF")
+
+
+def test_another_language_is_one_file(certificates, tmp_path):
+    english = (Path(languages.__file__).parent / "en.toml").read_text()
+    path = tmp_path / "fr.toml"
+    french = english.replace('"en"', '"fr"').replace('"Calibration certificate"', '"Certificat d\'étalonnage"')
+    path.write_text(french)
+    assert "Certificat d&#39;étalonnage" in certificate_html(certificates["joint"], language=path)
+    wrong = {
+        french.replace('probe = "Probe"\n', ""): ["[labels] lacks 'probe'"],
+        french.replace("[counts]", 'other = "x"\n[counts]'): ["[sentences] has the unknown key 'other'"],
+        french.replace("{count} more", "more"): ["needs the same names in braces"],
+        french.replace('"fr"', '"French"'): ["language code"],
+    }
+    for text, parts in wrong.items():
+        path.write_text(text)
+        assert_refused(lambda: certificate_html(certificates["joint"], language=path), path, *parts)
+    assert_refused(lambda: certificate_html(certificates["joint"], language="fr"), "'fr'", "de or en")
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("<a/>", ["give a DCC"]),
+        ('<a xmlns="https://ptb.de/dcc"/>', ["give a DCC"]),
+        ('<d:digitalCalibrationCertificate xmlns:d="https://ptb.de/dcc"/>', ["has no administrativeData"]),
+    ],
+)
+def test_what_is_no_certificate_is_not_printed(text, parts):
+    assert_refused(lambda: certificate_html(text), *parts)
+
+
+def test_a_logo_is_a_small_png_or_svg_file(tmp_path):
+    about, logo = tmp_path / "about.toml", tmp_path / "logo.x"
+    about.write_text('laboratory = { name = "L", logo = "logo.x" }')
+    for content in (SVG, PNG):
+        logo.write_bytes(content)
+        assert aj.files.read_logo(about) == content
+    bomb = PNG[:16] + (100_000).to_bytes(4) * 2 + PNG[24:]
+    wrong = ((b"\xff\xd8\xff", "PNG or SVG"), (SVG + b" " * 1_000_000, "1 MB"), (bomb, "100000 x 100000 pixels"))
+    for content, part in wrong:
+        logo.write_bytes(content)
+        assert_refused(lambda: aj.files.read_logo(about), logo, part)
+    logo.unlink()
+    assert_refused(lambda: aj.files.read_logo(about), logo, "does not exist")
+    about.write_text("")
+    assert aj.files.read_logo(about) is None
+
+
+@pytest.mark.parametrize(
+    "damage", [b"<svg", b"<svg><g></svg>", SVG.replace(b"<rect", b'<image href="/etc/hostname"/><rect')]
+)
+def test_a_logo_that_cannot_be_drawn_or_names_a_file_is_one_sentence(certificates, damage):
+    assert_refused(lambda: certificate_pdf(certificates["joint"], logo=damage), "cannot be set as PDF")
