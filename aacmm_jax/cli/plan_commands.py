@@ -223,7 +223,8 @@ def plan(
 
             sources = [fingerprint(arm)] if os.path.isfile(arm) else [f"{arm} (ships with aacmm)"]
             sources += [] if kit is None else [fingerprint(kit)]
-            write_plan(page, planned, summary, angles=angles, both_sides=both_sides, sources=sources)
+            shown = {"angles": angles, "both_sides": both_sides, "sources": sources}
+            write_plan(page, planned, summary=summary, **shown)
     written = ", ".join(str(path) for path in (output, manifest, page) if path is not None)
     show_summary(summary | {"written": written}, as_json, view)
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..acceptance.procedure import Procedure
 from ..acceptance.record import SIMULATED
 from ..core.errors import require
 from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity
@@ -14,6 +15,8 @@ from ..files.hdf5 import provenance, read_summary, read_tables
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together, write_text
 from ..files.plans import Angles
+from ..planning.design import Plan
+from ..planning.kit import KitPlan
 from ..plot.charts import Chart
 from ..plot.svg import drawn, key, points, shade_keys
 from ..summaries import planning
@@ -46,6 +49,11 @@ _ROWS: dict[str, tuple[tuple[str, str, str, bool], ...]] = {
         ("certificate", "place", "Place", False),
         ("certificate", "remarks", "Remarks", False),
     ),
+}
+_PLANS: dict[type, tuple[Any, Any]] = {
+    Plan: (planning.plan_summary, planning.plan),
+    KitPlan: (planning.kit_plan_summary, planning.kit_plan),
+    Procedure: (planning.procedure_summary, planning.procedure),
 }
 _ADDRESS = ("street", "postal_code", "city", "country", "email", "phone")
 
@@ -89,9 +97,10 @@ def write_report(
 
 def write_plan(
     target: str | os.PathLike,
-    planned: Any,
-    summary: dict[str, Any],
+    planned: Plan | KitPlan | Procedure,
+    arm: str = "",
     *,
+    summary: dict[str, Any] | None = None,
     angles: Angles = "deg",
     both_sides: bool = False,
     sources: Sequence[str] = (),
@@ -106,14 +115,15 @@ def write_plan(
         target: The HTML file to write, whole or not at all.
         planned: The plan of a calibration (`planning.plan`, `planning.plan_kit`) or of an acceptance test
             (`acceptance.plan_procedure`).
-        summary: Its summary, of `summaries.planning`.
+        arm: What the arm is called.
+        summary: What ``aacmm plan --json`` prints of the plan; by default without the source of the noise.
         angles: Unit of the joint readings, "deg" or "rad".
         both_sides: Whether every pose is taken twice, as in `files.save_plan`.
         sources: Names and digests of the files that the plan was made from.
 
     Example:
         >>> plan = aj.planning.plan(arm, sockets={"A": (400, 200, 300)}, poses=12, noise=noise, candidates=200)
-        >>> written = aj.report.write_plan("plan.html", plan, aj.summaries.planning.plan_summary(plan, "my arm"))
+        >>> written = aj.report.write_plan("plan.html", plan, "my arm")
         >>> print(written["title"])
         Plan of a calibration, my arm
     """
@@ -121,9 +131,10 @@ def write_plan(
     from ..files.plans import plan_csv
     from .plans import plan_report
 
-    view = {"plan": planning.plan, "kit plan": planning.kit_plan}.get(summary["kind"], planning.procedure)
+    summarise, view = _PLANS[type(planned)]
+    shown = summarise(planned, arm) if summary is None else summary
     with together(target):
-        report = plan_report(planned, summary, view(summary), plan_csv(planned, angles, both_sides))
+        report = plan_report(planned, shown, view(shown), plan_csv(planned, angles, both_sides))
         attributes = provenance("plan") | {"sources": list(sources) or ["none"]}
         return _written(report, _origin(None, attributes), Path(target))
 

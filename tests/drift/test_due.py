@@ -20,6 +20,7 @@ YEARS = [datetime.datetime(2024 + i, 1, 1, tzinfo=datetime.UTC) for i in range(3
 )
 def test_it_is_when_lengths_have_changed_by_the_limit(changes, limit, after, capped):
     due = aj.drift.next_due(YEARS, changes, limit)
+    assert due is not None
     assert (due.date - YEARS[-1]).total_seconds() / 86400 == pytest.approx(after, abs=0.5)
     assert due.capped is capped
 

@@ -509,6 +509,7 @@ def test_charts_of_an_evaluation(written):
     report = evaluation_report(written.evaluation)
     blocks = [block for section in report.sections for block in section.blocks]
     plots = {block.id: block.plots[0] for block in blocks if isinstance(block, charts.Chart) and block.plots}
+    assert isinstance(report.picture, charts.Chart)
     assert report.picture.id == "margins"
     assert report.picture.plots[0].y.low == 0  # of absolute values
     readings = plots["length-errors"]
@@ -864,8 +865,7 @@ def test_a_plan_has_a_page_for_the_machine(tmp_path, paper_arm):
         paper_arm, sockets={HOSTILE: (400, 200, 300), "B": (700, 500, 500)}, lengths=[(HOSTILE, "B", 0.002)], poses=12,
         noise=aj.Noise(encoder_arcsec=2.0, seating=0.005), candidates=100, seed=1,
     )  # fmt: skip
-    summary = aj.summaries.planning.plan_summary(plan, "my arm")
-    written = aj.report.write_plan(tmp_path / "plan.html", plan, summary, sources=["arm.toml (SHA-256 0)"])
+    written = aj.report.write_plan(tmp_path / "plan.html", plan, "my arm", sources=["arm.toml (SHA-256 0)"])
     found = Page((tmp_path / "plan.html").read_text(encoding="utf-8"))
     assert written["title"] == "Plan of a calibration, my arm"
     assert written["verdict"] in " ".join(found.text.split()) or "A calibration with these 12 poses" in found.text
