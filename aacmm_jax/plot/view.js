@@ -72,68 +72,14 @@ class CanvasPen {
   end() {}
 }
 
-class SvgPen {
-  constructor(container) {
-    this.immediate = true; // so that what is printed is drawn before
-    container.insertAdjacentHTML("beforeend", '<svg aria-hidden="true"></svg>');
-    this.svg = container.lastElementChild;
-    this.measure = document.createElement("canvas").getContext("2d");
-    this.measure.font = FONT;
-  }
-
-  begin(width, height) {
-    this.svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
-    this.parts = [];
-  }
-
-  #draw(name, attributes, style, text = "") {
-    const given = Object.entries(attributes).map(([key, value]) => `${key}="${value}"`).join(" ");
-    this.parts.push(`<${name} ${given} style="${style}">${text}</${name}>`);
-  }
-
-  #points(points) {
-    return points.map(([x, y]) => `${x.toFixed(1)},${y.toFixed(1)}`).join(" ");
-  }
-
-  line(points, colour, width, dash = []) {
-    const style = `fill:none;stroke:var(--${colour});stroke-width:${width.toFixed(1)};stroke-linecap:round;`
-      + "stroke-linejoin:round" + (dash.length ? `;stroke-dasharray:${dash}` : "");
-    this.#draw("polyline", { points: this.#points(points) }, style);
-  }
-
-  area(points, colour) {
-    this.#draw("polygon", { points: this.#points(points) }, `fill:var(--${colour});fill-opacity:0.3`);
-  }
-
-  dot([x, y], radius, fill, edge, width = 2) {
-    const stroke = edge ? `;stroke:var(--${edge});stroke-width:${width}` : "";
-    this.#draw("circle", { cx: x.toFixed(1), cy: y.toFixed(1), r: radius.toFixed(1) },
-      `fill:${fill ? `var(--${fill})` : "none"}${stroke}`);
-  }
-
-  words(text, x, y, colour) {
-    const escaped = text.replace(/[&<>"]/g, (sign) => `&#${sign.charCodeAt(0)};`);
-    this.#draw("text", { x: x.toFixed(1), y: y.toFixed(1) }, `font:${FONT.replaceAll('"', "'")};fill:var(--${colour});`
-      + "stroke:var(--page);stroke-width:4;paint-order:stroke;stroke-linejoin:round", escaped);
-  }
-
-  width(text) {
-    return this.measure.measureText(text).width;
-  }
-
-  end() {
-    this.svg.innerHTML = this.parts.join("");
-  }
-}
-
 const FONT = "600 13px system-ui, 'DejaVu Sans', sans-serif";
 const FLAT = 1.5708;
 
 export class View {
-  // On a canvas, or in any other element as SVG.
-  constructor(element) {
+  // On a canvas, or with another pen in any other element.
+  constructor(element, pen) {
     this.element = element;
-    this.pen = element instanceof HTMLCanvasElement ? new CanvasPen(element) : new SvgPen(element);
+    this.pen = pen ?? new CanvasPen(element);
     this.turn = -0.9;
     this.tilt = 0.4;
     this.zoom = 1;
