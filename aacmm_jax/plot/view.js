@@ -1,5 +1,5 @@
-// The arm in three dimensions: a few hundred strokes, sorted by depth, drawn with a pen. Live captures draw on a canvas,
-// reports as SVG, which prints and follows the colours of the page. Neither needs WebGL, which a computer in a
+// The arm in three dimensions: a few hundred strokes, sorted by depth, drawn with a pen. Live captures use a canvas,
+// reports SVG, which prints and follows the colours of the page. Neither needs WebGL, which a computer in a
 // laboratory or at the end of a remote desktop may lack, and all of it is a hundredth of a library's weight.
 
 const usable = (point) => point?.length === 3 && point.every(Number.isFinite);
@@ -311,7 +311,8 @@ export class View {
     for (const pose of poses) {
       if (!usable(pose.tip)) continue;
       const from = this.#project(pose.tip);
-      this.strokes.push({ depth: from[2] - 0.001, paint: () => pen.dot(from, 2 + 0.5 * (pose.shade ?? 0), colour(pose)) });
+      const radius = 2 + 0.5 * (pose.shade ?? 0);
+      this.strokes.push({ depth: from[2] - 0.001, paint: () => pen.dot(from, radius, colour(pose)) });
       if (!usable(pose.residual)) continue;
       const size = Math.min(this.enlarged, 0.4 * this.extent / Math.hypot(...pose.residual)); // an outlier's has an end
       const to = pose.tip.map((value, i) => value + size * pose.residual[i]);

@@ -134,7 +134,7 @@
 
     words(text, x, y, colour) {
       const escaped = text.replace(/[&<>"]/g, (sign) => `&#${sign.charCodeAt(0)};`);
-      this.#draw("text", { x: x.toFixed(1), y: y.toFixed(1) }, `font:${FONT.replaceAll('"', "'")};fill:var(--${colour});`
+      this.#draw("text", { x: x.toFixed(1), y: y.toFixed(1) }, `font:${FONT};fill:var(--${colour});`
         + "stroke:var(--page);stroke-width:4;paint-order:stroke;stroke-linejoin:round", escaped);
     }
 
