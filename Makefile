@@ -42,7 +42,7 @@ SUMMARY := sed '/^Warning/,$$d'
 OTHER_ROUNDING := OPENBLAS_CORETYPE=Nehalem XLA_FLAGS=--xla_cpu_max_isa=SSE4_2
 
 .PHONY: demo test test-slow test-rounding test-exhaustive test-newest install-newest run-newest test-lowest check package \
-	package-matrix release audit bench peers docs reproduce clean
+	package-matrix release audit bench peers evidence docs reproduce clean
 
 demo: .venv/.run
 	$(BIN)/aacmm demo aacmm-demo
@@ -129,7 +129,10 @@ bench: .venv/.test
 reproduce: .venv/.test
 	$(BIN)/python benchmarks/cheng2018/reproduce.py $(if $(WRITE),--write)
 
-peers: benchmarks/peers/pybotics/.venv/.done
+evidence: .venv/.test
+	$(BIN)/python benchmarks/evidence.py
+
+peers: $(foreach peer,pybotics figaroh opencv,benchmarks/peers/$(peer)/.venv/.done)
 
 benchmarks/peers/%/.venv/.done: benchmarks/peers/%/requirements.txt
 	$(PYTHON) -m venv $(@D)

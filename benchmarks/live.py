@@ -104,7 +104,9 @@ def guided(search: Search, rows: np.ndarray, target: float) -> int:
         u = search.u(information)
         if u <= target:
             return number
-        ahead = search.ahead(pool.known(information), ahead, np.maximum(2 - counts, 0), target if u < 3 else None)
+        ahead = search.ahead(
+            pool.known(information), ahead, np.maximum(2 - counts, 0), target if u < 3 else None, search.lacking(taken)
+        )
     return MOST
 
 

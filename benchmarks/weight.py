@@ -1,8 +1,8 @@
 """What an installation weighs, and how long a new user waits for help, import, arm and first result: first and later.
 
-Run as `python benchmarks/weight.py [--extras]`: the wheel is built, and installed in an empty environment; `--extras`
-installs each extra, too, and all of them. CPU seconds of each command with its children, and wall time. The first time,
-Python compiles what it imports, and JAX's compilation cache is empty.
+Run as `python benchmarks/weight.py [--waits] [--extras]`: the wheel is built, and installed in an empty environment;
+`--waits` measures commands in it, `--extras` installs each extra, too, and all of them. CPU seconds of each command
+with its children, and wall time. The first time, Python compiles what it imports, and JAX's compilation cache is empty.
 """
 
 import importlib.machinery
@@ -34,7 +34,6 @@ WAITS = {
         POSITION,
     ],
     "`aacmm calibrate`, Panda, 497 poses, `--model dh`": ["aacmm", "calibrate", PANDA, "-o", "a.h5", "--model", "dh"],
-    "`aacmm calibrate`, the same, models compared": ["aacmm", "calibrate", PANDA, "-o", "b.h5"],
     "`aj.identify_many`, 1,000 problems": ["python", "-c", BATCH],
 }
 
@@ -72,7 +71,8 @@ def main() -> None:
         wheel = package.build(scratch, python)
         programs = package.environment(scratch / "core", python, wheel)
         (scratch / "work").mkdir()
-        waits(package, programs, scratch / "work")
+        if "--waits" in sys.argv:
+            waits(package, programs, scratch / "work")
         core, count = weight(package, programs)
         print(f"\n| extra | MB | packages |\n|---|---|---|\n| core | {core:.0f} | {count} |", flush=True)
         for extra in package.USERS if "--extras" in sys.argv else ():

@@ -6,7 +6,8 @@ Snippets of the pages are run by tests/docs/test_pages.py, each page by itself, 
 * ```` ```console ````: each line that begins with ``$ aacmm`` is run in a temporary folder that contains `examples`;
   the lines after it show what it prints, and are not compared.
 * ```` ```toml ```` after a line ``<!-- file: name.toml -->``: written to that file of the temporary folder first.
-* ```` ```text ````, and any block after a line ``<!-- not run: reason -->``: not run.
+* ```` ```text ````, ```` ```bash ````, other ```` ```toml ````, and any block after a line
+  ``<!-- not run: reason -->``: not run.
 
 `make docs NOTEBOOKS=stored` shows the outputs that the notebooks are stored with, and runs none.
 """
@@ -35,6 +36,7 @@ extensions = [
     "file_pages",
     "gallery",
     "accessible",
+    "glossary_links",
     "llms",
 ]
 exclude_patterns = ["_build", "notebooks/README.md"]
@@ -50,7 +52,6 @@ html_search_scorer = str(HERE / "search_scorer.js")
 pygments_dark_style = "github-dark"
 copybutton_prompt_text = "$ "  # of console blocks the commands are copied, and not what they print
 copybutton_line_continuation_character = "\\"
-copybutton_exclude = ".linenos, .gp"
 html_copy_source = False
 html_show_search_summary = False  # would be fetched, which a page on a disk may not do
 toc_object_entries = False

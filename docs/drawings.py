@@ -85,7 +85,7 @@ def _on_table(title: str) -> Drawing:
 
 
 def logo() -> None:
-    """The logo: an arm whose ball rests in a socket, and a pose from the other side."""
+    """The logo: an arm whose ball rests in a socket."""
     drawing = Drawing((120, 120), "aacmm_jax")
     drawing.add("path", d="M14,108 l7,-18 h26 l7,18 z", fill=BLUE)
     drawing.line([(34, 92), (28, 46), (66, 20), (86, 56)], BLUE, 10)
@@ -144,7 +144,7 @@ def _convention(name: str, title: str, steps: Sequence[tuple[str, str, float, st
                 BLUE,
             )
         else:
-            radius, angles = 58.0, np.linspace(0, amount, 30)
+            radius, angles = (58.0 if axis == "z" else 38.0), np.linspace(0, amount, 30)
             local = [(radius * np.cos(t), radius * np.sin(t), 0) if axis == "z" else
                      (0, -radius * np.sin(t), radius * np.cos(t)) for t in angles]  # fmt: skip
             arc = [seen(frame, *point) for point in local]
@@ -154,7 +154,7 @@ def _convention(name: str, title: str, steps: Sequence[tuple[str, str, float, st
                              opacity=0.6)  # fmt: skip
             drawing.line(arc[:-1], ORANGE, 2)
             drawing.arrow(arc[-4], arc[-1], ORANGE, 2)
-            middle = 1.32 * np.array(local[15])
+            middle = 1.75 * np.array(local[15]) if axis == "z" else 1.45 * np.array(local[12])
             drawing.text(seen(frame, *middle) + np.array([0, 5]), label, ORANGE)
         frame = end
     axes(frame, "i")
@@ -205,7 +205,7 @@ def plate() -> None:
             drawing.disc((366 + 44 * column + 17 * row, 205 - 17 * row), 4)
     drawing.line([(340, 217), (340, 249)], width=4)
     drawing.line([(550, 217), (550, 249)], width=4)
-    drawing.text((470, 145), "certified coordinates of every hole", ORANGE)
+    drawing.text((508, 148), "certified coordinates of every hole", ORANGE)
     drawing.text((465, 275), "place and tilt are found by the calibration")
     drawing.save("how_to/plate")
 

@@ -88,7 +88,7 @@ def before_and_after() -> None:
         tips = [np.asarray(by.position(np.asarray(q))) for n, q in capture.sockets.items() if n.startswith(place + "/")]
         return np.concatenate([tip - tip.mean(axis=0) for tip in tips])
 
-    figure = Figure(figsize=(7.2, 3.1), layout="constrained")
+    figure = Figure(figsize=(7.2, 2.6), layout="constrained")
     cloud, bars = figure.subplots(1, 2, width_ratios=(1, 1.7))
     shown = "mid_left"
     for label, by, colour, size in (("nominal", arm, ORANGE, 16), ("calibrated", calibrated[shown], BLUE, 9)):

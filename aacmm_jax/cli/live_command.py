@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from ..core.text import pluralise
 from ..uncertainty.coverage import U_AT_LEVEL
 from . import options
 from .app import command
@@ -71,9 +72,11 @@ def live(
         else:
             _serve(session, port, token, not no_browser)
             written = session.state()["paths"]
-        poses = len(session.state()["poses"])
+        poses = session.state()["poses"]
     if written:
-        typer.echo(f"{poses} poses; written: {', '.join(written)}")
+        used = sum(not (pose["outlier"] or pose["excluded"]) for pose in poses)
+        left = f" ({len(poses) - used} left out)" if used < len(poses) else ""
+        typer.echo(f"{pluralise(used, 'pose')}{left}; written: {', '.join(written)}")
     else:
         typer.echo(f"{poses} poses are kept in {output}.journal; run the same command to go on.")
 

@@ -65,6 +65,12 @@ def fill(text: str, values: Mapping[str, str]) -> str:
     return _FIELD.sub(lambda field: values[field.group(1)], text)
 
 
+def matching(pattern: str, names: Iterable[str]) -> list[dict[str, str]]:
+    """The values of the fields for each name that the pattern matches as a whole, as in `matches`."""
+    expression, fields = re.compile(_expression(pattern, _WORD)), list(dict.fromkeys(_FIELD.findall(pattern)))
+    return [dict(zip(fields, found.groups(), strict=True)) for name in names if (found := expression.fullmatch(name))]
+
+
 def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dict[str, str]]:
     """The values of the fields for each file below ``folder`` that the pattern matches, in the order of the paths.
 
@@ -82,15 +88,11 @@ def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dic
         )
 
     paths = below("*".join(map(glob.escape, _FIELD.sub("\0", pattern).split("\0"))))
-    left_out = [
-        path for path in paths if any(fnmatch.fnmatchcase(name, x) for x in exclude for name in (path, Path(path).name))
-    ]
+    left_out = [path for path in paths if _is_excluded(path, exclude)]
     kept = [path for path in paths if path not in set(left_out)]
-    names = list(dict.fromkeys(_FIELD.findall(pattern)))
-    strict, loose = (re.compile(_expression(pattern, partial)) for partial in (_WORD, _ANYTHING))
-    values = [dict(zip(names, match.groups(), strict=True)) for path in kept if (match := strict.fullmatch(path))]
-    if values:
+    if values := fields_matched(kept, pattern):
         return values
+    loose = re.compile(_expression(pattern, _ANYTHING))
     where = f"no file matches '{pattern}' in {folder}"
     near = [f"'{path}'" for path in kept if loose.fullmatch(path)]
     if near:
@@ -107,6 +109,17 @@ def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dic
     files = [path for path in below(glob.escape(fixed) + "/" * bool(fixed) + deeper) if os.path.isfile(before + path)]
     alike = [f"'{path}'" for path in difflib.get_close_matches(pattern, files, n=_SHOWN, cutoff=0.3)]
     raise InputError(f"{where}" + (f"; similar names: {', '.join(alike)}" if alike else "") + "; check the path.")
+
+
+def _is_excluded(path: str, exclude: Sequence[str]) -> bool:
+    return any(fnmatch.fnmatchcase(name, x) for x in exclude for name in (path, Path(path).name))
+
+
+def fields_matched(paths: Iterable[str], pattern: str, exclude: Sequence[str] = ()) -> list[dict[str, str]]:
+    """The values of the fields for each of these paths that the pattern matches."""
+    strict, names = re.compile(_expression(pattern, _WORD)), list(dict.fromkeys(_FIELD.findall(pattern)))
+    kept = (path for path in paths if not _is_excluded(path, exclude))
+    return [dict(zip(names, match.groups(), strict=True)) for path in kept if (match := strict.fullmatch(path))]
 
 
 def _expression(pattern: str, partial: str) -> str:

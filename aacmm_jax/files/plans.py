@@ -166,6 +166,7 @@ def _file_of(procedure: Procedure, item: ProcedureItem) -> str:
 
 
 _ROWS = "(one row per pose, in the order of the plan{}), then run: aacmm import THIS.toml -o {}.h5"
+_ONE_TABLE = '# measurements = "THIS.csv"   # one table in place of the files, with the columns of the plan'
 _WHAT = {
     Plan: "Manifest of a planned calibration. Fill in the calibrated lengths and uncertainties (k = 1), record one "
     "file per socket " + _ROWS.format("", "capture"),
@@ -214,7 +215,7 @@ def plan_manifest(
             f"measuring_range = {plan.measuring_range:.0f}   # mm: diameter of the measuring volume, as the maker "
             "states it"
         )
-        size = [stated if plan.range_stated else f"# {stated} (the plan assumes twice the reach)"]
+        size = [_ONE_TABLE, stated if plan.range_stated else f"# {stated} (the plan assumes twice the reach)"]
         tables = _of_procedure(plan)
     beside = ["# date = 2026-01-31   # day of the measurement", *size, "", "[angles]", f'unit = "{angles}"']
     return manifest_text(what, entries, beside, tables)

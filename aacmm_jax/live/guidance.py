@@ -38,6 +38,7 @@ from .proposals import NextPose, Proposals
 
 _FREEDOM = 4.0  # degrees of freedom that the usual noise counts
 _WRONG, _RIGHT = 1e-3, 0.05  # probability, times the number of poses, of an outlier; probability of one that fits again
+_ENDLESS = 1e9  # degrees of freedom of a known noise
 _NEWER = 0.8  # of the largest ratio, from which the newest pose is the outlier
 _OPEN = 1e-3  # eigenvalue of I - H below which nothing else shows an error of the pose
 _LEAST_U = 1e-4  # mm: smallest standard uncertainty of what is certified
@@ -121,8 +122,10 @@ class Guide:
             outliers = solution.outliers(newest)
             if outliers == wrong:
                 break
-            wrong = outliers
-            solution = self._solved(poses, wrong)
+            try:
+                solution, wrong = self._solved(poses, outliers), outliers
+            except InputError:  # the others alone determine too little to say that
+                break
         self._wrong = wrong
         return self._guidance(poses, solution, last)
 
@@ -299,7 +302,9 @@ class _Solution(NamedTuple):
             own = (squares[i], count[i]) if self.used[i] else (0.0, 0)
             freedom = max(self.freedom - own[1], 1.0)
             ratios[i] = squares[i] / count[i] / (max(self.squares - own[0], _FREEDOM) / freedom)
-            probabilities[i] = f_tail(ratios[i], int(count[i]), freedom)
+            # What the usual noise explains is no outlier, however small the residuals of all others are.
+            if f_tail(squares[i] / count[i], int(count[i]), _ENDLESS) < _RIGHT:
+                probabilities[i] = f_tail(ratios[i], int(count[i]), freedom)
         still = {
             int(n) for n, p, used in zip(self.numbers, probabilities, self.used, strict=True) if not used and p < _RIGHT
         }

@@ -43,7 +43,9 @@ class Journal:
             raise InputError(f"{path} cannot be written ({error.strerror}); choose another output path.") from error
         try:
             self.events = self._read()
-            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+            # As bytes: in the text mode that Windows has by default, every line would get a byte more.
+            binary = getattr(os, "O_BINARY", 0)
+            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | binary, 0o644)
             if self.dropped:
                 os.ftruncate(self._file, self._end)
             self._sync_folder()

@@ -5,6 +5,7 @@ artefact, or an instrument that sees the tip wherever it is. The observation tha
 simulated thing would record, with the readings and measured values in place of its own.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -150,7 +151,8 @@ def setup_of(
             f"a live capture is of one chain, but this robot has {len(specification.arm.chains)} ({chains}); name the "
             "tip of one (--tip), and capture each on its own."
         )
-    places: list[Place] = []
+    planned, places = list(planned), list[Place]()
+    counts = Counter(name for name, _ in planned)
     for given in kit:
         item = given if isinstance(given, KitItem) else KitItem(given, places=0)
         thing: AbstractSimulated = item.simulated
@@ -160,7 +162,7 @@ def setup_of(
             known = isinstance(thing, SimulatedSocket | SimulatedArtefact) and not item.places
             for label, tip in zip(labels, tips, strict=True):
                 name = f"{placed.name}/{label}" if label else placed.name
-                wanted = thing.poses or _WANTED
+                wanted = counts[name] or thing.poses or _WANTED
                 places.append(Place(name, placed, label, tip if known else None, wanted, item))
     if not places:
         raise InputError("there is no place for poses; give a kit with a socket, an artefact or an instrument.")

@@ -1,5 +1,6 @@
 """What devices have said so far: the present readings, whether the arm is at rest, and what came beside them."""
 
+import time
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
@@ -24,6 +25,7 @@ class Readings:
         self.columns: dict[str, float] = {}
         self.measured: list[Mapping[str, Any]] = []  # what instruments have seen since the arm is at rest
         self.time = -np.inf  # of the device, at the last reading
+        self._still_from = np.inf  # of this computer, when the present rest began
         self._arm, self._times = arm, deque[float](maxlen=50)
         self._stillness, self.sides = Stillness(arm.joints), Sides(arm)
         self._pressed: frozenset[str] = frozenset()  # buttons of the arm
@@ -42,8 +44,6 @@ class Readings:
     def add(self, sample: Sample) -> tuple[frozenset[str], bool]:
         """The buttons that this sample says are pressed anew, and whether the device's clock has begun anew."""
         self.columns |= sample.columns
-        if sample.measured:
-            self.measured = [*self.measured[-_MOST_MEASURED:], sample.measured]
         now = frozenset(name for name in BUTTONS if self.columns.get(name))
         pressed, self._pressed, anew = now - self._pressed, now, False
         if sample.q is not None:
@@ -53,9 +53,13 @@ class Readings:
             self.time = sample.time
             self._stillness.add(sample)
             self.sides.add(sample.q)
-            if self.rest is None:
-                self.measured = []
             self._times.append(sample.time)
+            if self.rest is None:
+                self.measured, self._still_from = [], np.inf
+            elif self._still_from == np.inf:
+                self._still_from = time.monotonic() - (self.rest.until - self.rest.since)
+        if sample.measured and time.monotonic() - sample.delay >= self._still_from:  # else it was seen on the way
+            self.measured = [*self.measured[-_MOST_MEASURED:], sample.measured]
         return pressed, anew
 
     def beside(self) -> dict[str, float]:

@@ -21,6 +21,7 @@ class Sample(NamedTuple):
         measured: What an instrument measured, by the entries of its observation: ``points`` (a tracked point ``(3,)``
             in the station's frame, mm), ``rotations`` ``(3, 3)``, ``values`` (a distance, mm), ``corners`` ``(c, 2)``
             (px) with ``ids`` ``(c,)``.
+        delay: How long ago that was seen when it is given, s, as the search for corners in an image takes some time.
 
     Example:
         >>> aj.live.Sample(0.01, np.zeros(6), {"temperature_C": 20.1}).columns["temperature_C"]
@@ -31,6 +32,7 @@ class Sample(NamedTuple):
     q: Float[np.ndarray, " n"] | None = None
     columns: Mapping[str, float] = {}
     measured: Mapping[str, Float[np.ndarray, "..."] | Int[np.ndarray, "..."]] = {}
+    delay: float = 0.0
 
 
 def lines_of(samples: Sequence[Sample]) -> bytes:

@@ -141,13 +141,20 @@ def _keys() -> Iterator["queue.Queue[str]"]:
         yield pressed
 
 
+def _console_key(read: Callable[[], str]) -> str:
+    """A key of the console of Windows, where arrows and function keys are two characters and Ctrl-C is one."""
+    while (key := read()) in ("\x00", "\xe0"):
+        read()
+    return "q" if key == "\x03" else key
+
+
 @contextlib.contextmanager
 def _unbuffered() -> Iterator[Callable[[], str]]:
     """A function that waits for one key of standard input; an empty text at its end."""
     if os.name == "nt" and sys.stdin.isatty():
         import msvcrt
 
-        yield lambda: msvcrt.getwch()  # pyright: ignore[reportAttributeAccessIssue]
+        yield lambda: _console_key(msvcrt.getwch)  # pyright: ignore[reportAttributeAccessIssue]
         return
     if not sys.stdin.isatty():
         yield lambda: sys.stdin.read(1)

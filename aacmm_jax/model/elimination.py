@@ -63,8 +63,8 @@ def sums_by_component(
 ) -> Float[AnyArray, "K k h"]:
     """Products of both, summed over the rows of each component."""
     xp, count = namespace(first, second), len(sizes)
-    if not count:
-        return xp.zeros((0, first.shape[0], second.shape[0]))
+    if not (count and first.shape[0] and second.shape[0]):  # no component, or nothing but components is free
+        return xp.zeros((count, first.shape[0], second.shape[0]))
     if len(set(sizes)) == 1 and (xp is not np or sizes[0] >= _LONG):
         split = (part.reshape(*part.shape[:2], count, -1) for part in (first, second))
         left, right = (xp.moveaxis(part, 2, 0).reshape(count, part.shape[0], -1) for part in split)
@@ -86,7 +86,7 @@ def followed(
     xp, (k, r, _) = namespace(by_own, matrices), by_own.shape
     if sum(sizes) >= _LONG * len(sizes):
         products = [matrix.T @ flat(by_own[..., poses]) for matrix, poses in zip(matrices, _slices(sizes), strict=True)]
-        pieces = [product.reshape(len(product), r, -1) for product in products]
+        pieces = [product.reshape(len(product), r, product.shape[1] // r) for product in products]
         return pieces[0] if len(pieces) == 1 else xp.concatenate(pieces, axis=-1)
     owner = owner_of(sizes)
     total: Any = 0.0

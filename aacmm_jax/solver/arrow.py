@@ -65,7 +65,7 @@ class Arrow(NamedTuple):
         head, parts = self.split(vector)
         top, below = (self.head @ head[..., None])[..., 0], []
         for crossed, block, part in zip(self.crossed, self.private, parts, strict=True):
-            flat = crossed.reshape(*crossed.shape[:-3], -1, crossed.shape[-1])
+            flat = _rows_of(crossed)
             top = top + (part.reshape(*part.shape[:-2], 1, -1) @ flat)[..., 0, :]
             of_head = (flat @ head[..., None])[..., 0]
             below.append((block @ part[..., None])[..., 0] + of_head.reshape(part.shape))
@@ -83,7 +83,7 @@ class Arrow(NamedTuple):
             whitening = inverse_cholesky(_damped(block, still, damping[..., None]))
             crossed = xp.where(still[..., None] | head_fixed[..., None, None, :], 0.0, crossed)
             by_head, alone = whitening @ crossed, (whitening @ part[..., None])[..., 0]
-            flat = by_head.reshape(*by_head.shape[:-3], -1, by_head.shape[-1])
+            flat = _rows_of(by_head)
             transposed = xp.swapaxes(flat, -1, -2)
             head = head - transposed @ flat
             head_right = head_right - (transposed @ alone.reshape(*alone.shape[:-2], -1)[..., None])[..., 0]
@@ -95,6 +95,12 @@ class Arrow(NamedTuple):
             rest = alone - (by_head @ solution[..., None, :, None])[..., 0]
             below.append((xp.swapaxes(whitening, -1, -2) @ rest[..., None])[..., 0])
         return joined(solution, *below)
+
+
+def _rows_of(blocks: Shaped[AnyArray, "*batch K k h"]) -> Shaped[AnyArray, "*batch r h"]:
+    """The rows of all blocks of a class, one below the other; the head may have no unknowns."""
+    *batch, count, size, width = blocks.shape
+    return blocks.reshape(*batch, count * size, width)
 
 
 def split(

@@ -9,7 +9,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -358,5 +358,7 @@ def _locked(output: OutputFile) -> Iterator[None]:
         yield
     finally:
         # Removed before it is released: otherwise a third process could lock a new file while a second has this one.
-        Path(lock.lock_file).unlink(missing_ok=True)
+        # Windows refuses to remove an open file; there, the lock itself removes it when it is released.
+        with suppress(PermissionError):
+            Path(lock.lock_file).unlink(missing_ok=True)
         lock.release()

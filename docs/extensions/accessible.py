@@ -1,12 +1,24 @@
-"""What readers with a keyboard or a screen reader need, and Sphinx leaves out: levels of captions, focus of code."""
+"""What readers with a keyboard or a screen reader need, and Sphinx leaves out.
+
+Captions in the list of pages get a level, code that is wider than the page can be scrolled by keys, and the arguments
+of a long signature are no list within a term.
+"""
+
+import re
+
+ARGUMENTS = re.compile(r'<dl>\n((?:<dd><em class="sig-param">.*?</dd>\n)+)</dl>', flags=re.DOTALL)
+
+
+def _lines(arguments: re.Match[str]) -> str:
+    return arguments[1].replace("<dd>", '<span class="argument">').replace("</dd>", "</span>")
 
 
 def _complete(app, page: str, template: str, context: dict, tree: object) -> None:
-    """Captions in the list of pages get a level; code that is wider than the page can be scrolled by keys."""
     for part in ("furo_navigation_tree", "body"):
         if context.get(part):
             text = context[part].replace('role="heading">', 'role="heading" aria-level="2">')
-            context[part] = text.replace("<pre>", '<pre tabindex="0">')
+            text = text.replace("<pre>", '<pre tabindex="0">')
+            context[part] = ARGUMENTS.sub(_lines, text)
 
 
 def setup(app) -> dict[str, object]:

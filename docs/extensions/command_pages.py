@@ -38,7 +38,7 @@ def _help(text: str) -> str:
     for paragraph in inspect.cleandoc(text).split("\n\n"):
         if paragraph.startswith("\b"):
             title, *lines = paragraph.splitlines()[1:]
-            parts.append("\n".join([title, "", "```text", *(line.strip() for line in lines), "```"]))
+            parts.append("\n".join([title, "", "```bash", *(line.strip() for line in lines), "```"]))
         else:
             parts.append(_options_as_code(paragraph))
     return "\n\n".join(parts)

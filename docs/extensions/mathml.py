@@ -11,7 +11,7 @@ def _converted(node, display: str) -> str:
     formula = convert(node.astext(), display=display)
     if "\\" in formula:
         logging.getLogger(__name__).warning("a formula has a command that cannot be shown: %s", node.astext())
-    return formula
+    return formula.replace("<mo>&#x02016;</mo>", '<mo stretchy="false">&#x02016;</mo>')  # else each as tall as it likes
 
 
 def _inline(translator: SphinxTranslator, node) -> None:

@@ -342,3 +342,14 @@ def test_known_coordinates_register_the_base(paper_arm, true, bounds):
     assert np.abs(error).max() < 4
     assert np.abs((np.array(base["rotation_rad"]) + frame[:3]) / base["rotation_u_rad"]).max() < 4
     assert 1e-4 < max(base["position_u_mm"]) < 0.01
+
+
+def test_nothing_but_the_frames_of_a_target_is_free():
+    """As by ``calibrate --arm-fixed``: the private and shared geometry is found, and the arm stays as it is."""
+    arm = aj.load_arm("ur10")
+    box, mount = [[-600, 300, 200], [600, 700, 600]], (10.0, 20.0, 80.0, 0.1, 0.2, 0.3)
+    target = kinds.SimulatedTransforms("T6", box, 60, mount, (0, 0, 0.4, 900.0, -100.0, 300.0), u=0.01, u_angle=1e-4)
+    capture = aj.simulate(arm, {}, observations=[target], noise=aj.Noise(encoder_arcsec=0.0, seating=0.0), seed=1)
+    bounds = aj.Bounds(aj.Parameters(arm, ()), np.zeros(0), np.zeros(0))
+    geometry = aj.calibrate(arm, capture, bounds).observed.geometry
+    np.testing.assert_allclose(geometry["offset of T6"], mount[:3], atol=0.02)

@@ -592,3 +592,19 @@ def test_what_is_stated_of_the_readings(tmp_path, motion, angles, socket, stated
 def test_the_time_of_day_of_a_date_is_left_out(tmp_path, motion):
     (tmp_path / "capture.toml").write_text("date = 2026-01-02T10:00:00\n" + SMALL)
     assert aj.files.read_manifest(tmp_path / "capture.toml").measured == "2026-01-02"
+
+
+def test_lengths_between_sockets_that_a_column_names(tmp_path, motion):
+    """Fields of a length are filled in by the names in the column; a place with one seat has no length."""
+    names = ["bar 1/left", "bar 1/right", "bar 2/left", "bar 2/right", "bar 3/left"]
+    rows = [[name, *map(repr, row)] for i, name in enumerate(names) for row in (motion + 0.1 * i).tolist()]
+    header = "socket," + ",".join(f"q{joint}" for joint in range(1, 7))
+    (tmp_path / "bar.csv").write_text("\n".join([header, *map(",".join, rows)]) + "\n")
+    grouped = HEAD + ANGLES + '[[socket]]\nfile = "bar.csv"\ngroup = "socket"\n[[length]]\nvalue = 500\nu = 0.001\n'
+    capture = read(tmp_path, grouped + 'from = "{place}/left"\nto = "{place}/right"\n')
+    assert [(length.start, length.end) for length in capture.lengths] == [
+        ("bar 1/left", "bar 1/right"),
+        tuple(names[2:4]),
+    ]
+    for ends in ('from = "{place}/left"\nto = "{other}/right"\n', 'from = "{place}/top"\nto = "{place}/right"\n'):
+        assert_refused(lambda ends=ends: read(tmp_path, grouped + ends), "uses a field that no")

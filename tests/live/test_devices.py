@@ -107,10 +107,11 @@ def test_packets_are_those_of_the_protocols():
 
 
 class Bus(threading.Thread):
-    """Answers as servos do, protocol 1, with an answer in ten spoilt."""
+    """Answers as servos do, with an answer in ten spoilt."""
 
-    def __init__(self, counts):
+    def __init__(self, counts, protocol=1):
         super().__init__(daemon=True)
+        self.protocol, self.length = protocol, {1: 8, 2: 14}[protocol]  # bytes of a request
         self.counts, self.spoilt, self.asked = counts, Counter(), 0
         self.master, self.slave = os.openpty()
         tty.setraw(self.slave)
@@ -124,15 +125,22 @@ class Bus(threading.Thread):
         waiting = b""
         while True:
             waiting += os.read(self.master, 100)
-            while len(waiting) >= 8:
-                packet, waiting = waiting[:8], waiting[8:]
+            while len(waiting) >= self.length:
+                packet, waiting = waiting[: self.length], waiting[self.length :]
                 self.asked += 1
-                body = bytes([packet[2], 4, 0]) + int(self.counts[packet[2]]).to_bytes(2, "little")
-                answer = b"\xff\xff" + body + bytes([~sum(body) & 255])
+                answer = self._packet(packet[2 if self.protocol == 1 else 4])
                 if self.asked % 10 == 0:
                     self.spoilt["checksum"] += 1
                     answer = answer[:-1] + bytes([answer[-1] ^ 1])
                 os.write(self.master, answer)
+
+    def _packet(self, servo):
+        counts = int(self.counts[servo])
+        if self.protocol == 1:
+            body = bytes([servo, 4, 0]) + counts.to_bytes(2, "little")
+            return b"\xff\xff" + body + bytes([~sum(body) & 255])
+        body = b"\xff\xff\xfd\x00" + bytes([servo, 8, 0, 0x55, 0]) + counts.to_bytes(4, "little", signed=True)
+        return body + crc_of_dynamixel(body).to_bytes(2, "little")
 
 
 def test_servos_on_a_bus_are_read_and_bad_answers_counted(tmp_path):

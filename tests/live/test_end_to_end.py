@@ -117,7 +117,7 @@ class Running:
         return said
 
 
-SLOWEST = ("SO-101 with a camera", "SCARA")
+SLOWEST = ("SO-101 with a camera",)
 
 
 @pytest.mark.parametrize(

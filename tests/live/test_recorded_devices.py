@@ -11,10 +11,11 @@ import time
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
 
-from .line_sources import checked_line, columns
+from .line_sources import Pty, Server, checked_line, columns
 from .test_devices import Bus
 
 ARM = "cheng2018-simulation"
@@ -78,10 +79,10 @@ class Capturing:
         return aj.files.load_capture(self.folder / "capture.h5").capture
 
 
-def driven(capturing: Capturing, poses: np.ndarray, send) -> None:
-    """Go from pose to pose and rest in each until it is taken, and a little longer."""
-    at = poses[0]
-    for number, goal in enumerate(poses, start=1):
+def driven(capturing: Capturing, poses: np.ndarray, send, at: np.ndarray | None = None, taken: int = 0) -> None:
+    """Go from ``at`` from pose to pose, and rest in each until it is taken, and a little longer."""
+    at = poses[0] if at is None else at
+    for number, goal in enumerate(poses, start=taken + 1):
         for q in np.linspace(at, goal, STEPS):
             send(q)
             time.sleep(HOLD)
@@ -152,20 +153,54 @@ class Recorder:
         time.sleep(0.5)
 
 
+class Cable:
+    """Lines on a real cable, a bad one in fifty; the cable is pulled once."""
+
+    kit = SOCKETS + LENGTH
+
+    def __init__(self, source):
+        self.source, self.sent, self.number = source, bytearray(), 0
+        self.device = f"{source.kind}:{source.where}?columns={columns(6)}&checksum=xor&checksum_after=*"
+
+    def send(self, q):
+        self.number = number = self.number + 1
+        if number == 120:
+            self.source.unplug()
+            time.sleep(0.3)
+            self.source.plug()
+        for line in [b"encoder 3?\n"] * (number % 50 == 0) + [checked_line(q, number)]:
+            self.source.send(line)
+            self.sent += line
+
+    def end(self):
+        time.sleep(0.5)
+        self.source.close()
+
+
 class Servos:
     """A bus of servos, an answer in ten spoilt."""
 
-    kit = SOCKETS
+    kit, protocol = SOCKETS, 1
     device = "servos:bus.toml"
 
     def __init__(self, folder):
-        self.bus = Bus(dict.fromkeys(range(1, 7), 2048))
+        self.bus = Bus(dict.fromkeys(range(1, 7), 2048), self.protocol)
         self.bus.start()
-        (folder / "bus.toml").write_text(f'port = "{self.bus.path}"\nids = [1, 2, 3, 4, 5, 6]\n')
+        (folder / "bus.toml").write_text(
+            f'port = "{self.bus.path}"\nids = [1, 2, 3, 4, 5, 6]\nprotocol = {self.protocol}\n'
+        )
 
     def send(self, q):
         counts = np.round(2048 + q * 4096 / (2 * np.pi)).astype(int)
-        self.bus.counts.update(enumerate(np.where(counts < 0, 0x8000 | -counts, counts), start=1))
+        if self.protocol == 1:
+            counts = np.where(counts < 0, 0x8000 | -counts, counts)
+        self.bus.counts.update(enumerate(counts, start=1))
+
+
+class ServosOfProtocol2(Servos):
+    """The same, with negative numbers in two's complement."""
+
+    protocol = 2
 
 
 class Simulated:
@@ -180,7 +215,18 @@ class Simulated:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [Datagrams, Recorder, Servos, Simulated])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        Datagrams,
+        Recorder,
+        Servos,
+        ServosOfProtocol2,
+        Simulated,
+        pytest.param(lambda folder: Cable(Pty(folder)), id="Serial"),
+        pytest.param(lambda folder: Cable(Server(folder)), id="Tcp"),
+    ],
+)
 def test_a_device_gives_a_capture_and_the_stream_has_every_sample(tmp_path, kind):
     source = kind(tmp_path)
     capturing = Capturing(tmp_path, source.device, source.kit, "--keep-stream", "stream")
@@ -195,7 +241,7 @@ def test_a_device_gives_a_capture_and_the_stream_has_every_sample(tmp_path, kind
     capture = capturing.written()
     stream = (tmp_path / "stream").read_bytes()
     if source.send is not None:
-        resolution = 2 * np.pi / 4096 if kind is Servos else 1e-6
+        resolution = 2 * np.pi / 4096 if isinstance(source, Servos) else 1e-6
         for name in POINTS:
             wanted = poses[[place == name for place in places]]
             np.testing.assert_allclose(capture.sockets[name], wanted, atol=resolution)
@@ -206,6 +252,11 @@ def test_a_device_gives_a_capture_and_the_stream_has_every_sample(tmp_path, kind
     elif kind is Datagrams:  # what came before the socket was open is lost
         assert len(stream) > 0.5 * (len(source.sent) - getattr(source, "unheard", 0))
         assert source.sent.endswith(stream)
+    elif isinstance(source, Cable):  # what was on the cable when it was pulled, or before it was there, is lost
+        lines, sent = stream.splitlines(), bytes(source.sent).splitlines()
+        assert len(lines) > 0.8 * len(sent[sent.index(lines[0]) :])
+        assert {*lines[:-1]} <= {*sent}
+        assert lines[-1] == sent[-1]
     else:
         samples = [json.loads(line) for line in stream.splitlines()]
         rows = np.array([sample["q"] for sample in samples])
@@ -215,15 +266,19 @@ def test_a_device_gives_a_capture_and_the_stream_has_every_sample(tmp_path, kind
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kit", [SOCKETS, TRACKER], ids=["sockets", "tracker"])
-def test_a_recording_that_is_played_back_gives_a_capture(tmp_path, kit):
+@pytest.mark.parametrize(
+    ("kit", "kind"),
+    [(SOCKETS, "sqlite3"), (TRACKER, "sqlite3"), (TRACKER, "mcap"), (TRACKER, "rosbag1")],
+    ids=["sockets", "tracker", "mcap", "ROS 1"],
+)
+def test_a_recording_that_is_played_back_gives_a_capture(tmp_path, kit, kind):
     pytest.importorskip("rosbags")
     from tests.files.table_sources.ros_recordings import record
 
     places, poses = seated()
-    record(tmp_path, "sqlite3", ARM, poses)
+    record(tmp_path, kind, ARM, poses)
     tables = "?speed=2" + "&table=/tracker" * (kit == TRACKER)
-    capturing = Capturing(tmp_path, f"bag:session{tables}", kit)
+    capturing = Capturing(tmp_path, f"bag:session{'.bag' * (kind == 'rosbag1')}{tables}", kit)
     while capturing.waits(len(poses)):
         time.sleep(0.05)
     time.sleep(1.0)  # it rests in the last pose, which is not taken again
@@ -238,3 +293,67 @@ def test_a_recording_that_is_played_back_gives_a_capture(tmp_path, kit):
         np.testing.assert_allclose(seen.q, poses, atol=1e-5)
         tips = np.asarray(aj.load_arm(ARM).position(poses))
         np.testing.assert_allclose(seen.points, tips, atol=0.02)
+
+
+CAMERA = """
+[[camera]]
+name = "webcam"
+image_size = [640, 480]
+intrinsics = { fx = 600, fy = 600, cx = 319.5, cy = 239.5 }
+
+[[target]]
+name = "board"
+kind = "charuco"
+squares = [7, 5]
+size = 30
+marker = 22
+
+[[pixels]]
+name = "eye"
+camera = "webcam"
+target = "board"
+distance = [250, 500]
+"""
+
+
+@pytest.mark.slow
+def test_a_camera_beside_a_recorder_gives_a_capture(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    arm, intrinsics, size = aj.load_arm(ARM), [600.0, 600.0, 319.5, 239.5], (640, 480)
+    facing = np.eye(4)
+    facing[:3, 3] = -105.0, -75.0, 400.0
+    middle = np.array([0.3, 0.4, -0.5, 0.6, 0.7, 0.2])
+    poses = middle + np.array([[0.0], [0.06], [-0.05], [0.1]]) * np.array([1, -1, 1, 1, -1, 2])
+    still = np.asarray(arm.pose(middle)) @ facing  # the board; the camera is in the last frame
+    frame = [*Rotation.from_matrix(still[:3, :3]).as_rotvec().tolist(), *still[:3, 3].tolist()]
+    source = Recorder(tmp_path)
+    kit = CAMERA + f"mount = [0, 0, 0, 0, 0, 0]\nframe = {frame}\n"
+    (tmp_path / "kit.toml").write_text(kit)
+    board = aj.live.read_setup(ARM, kit=tmp_path / "kit.toml").targets["board"]
+    seen = []
+    for q in poses:
+        transform = np.linalg.inv(np.asarray(arm.pose(q))) @ still
+        seen.append(np.asarray(aj.camera.render(board, transform, "pinhole", intrinsics, size)))
+
+    def film(image):
+        writer = cv2.VideoWriter(str(tmp_path / "next.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10, size)
+        for _ in range(3):  # it is soon over, and opened again
+            writer.write(np.repeat(image[:, :, None], 3, axis=2).astype(np.uint8))
+        writer.release()
+        os.replace(tmp_path / "next.avi", tmp_path / "seen.avi")
+
+    film(seen[0])
+    capturing = Capturing(
+        tmp_path, source.device, kit, "--device", "camera:seen.avi?rate=20", "--keep-stream", "stream"
+    )
+    for i, image in enumerate(seen):
+        film(image)
+        driven(capturing, poses[i : i + 1], source.send, poses[max(i - 1, 0)], i)
+    source.end()
+    capture = capturing.written()
+    (pixels,) = capture.observations
+    np.testing.assert_allclose(pixels.q, poses, atol=1e-6)
+    for i, image in enumerate(seen):
+        found, known = aj.camera.detect(image, board), np.asarray(pixels.ids[i]) >= 0
+        np.testing.assert_array_equal(np.asarray(pixels.ids[i])[known], found.ids)
+        np.testing.assert_allclose(np.asarray(pixels.corners[i])[known], found.corners, atol=0.3)

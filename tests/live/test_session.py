@@ -1,6 +1,7 @@
 """Sessions: what is taken, undone and excluded; journals that are continued, damaged and shared; processes killed."""
 
 import json
+import os
 import random
 import subprocess
 import sys
@@ -192,6 +193,9 @@ def test_two_processes_cannot_have_one_journal(session, tmp_path):
         Journal(journal_of(tmp_path / "c.h5"))
 
 
+open_file = os.open
+
+
 def journal_with(tmp_path, events: int) -> Path:
     path = tmp_path / "j.journal"
     journal = Journal(path)
@@ -205,6 +209,15 @@ def test_a_journal_gives_back_the_same_numbers(tmp_path):
     journal = Journal(journal_with(tmp_path, 3))
     assert [event["q"] for event in journal.events] == [[0.1 * i, np.pi] for i in range(3)]
     journal.close()
+
+
+def test_a_journal_is_written_as_bytes_where_files_have_a_text_mode(tmp_path, monkeypatch):
+    opened, binary = [], 0o100000  # on Windows, without this flag, each line ends with a carriage return, too
+    monkeypatch.setattr(os, "O_BINARY", binary, raising=False)
+    monkeypatch.setattr(os, "open", lambda path, flags, *mode: opened.append(flags) or open_file(path, flags, *mode))
+    journal_with(tmp_path, 1)
+    assert [flags for flags in opened if flags & os.O_APPEND and not flags & binary] == []
+    assert any(flags & os.O_APPEND for flags in opened)
 
 
 def test_wherever_a_journal_is_cut_only_the_last_event_is_lost(tmp_path):

@@ -12,6 +12,7 @@ import time
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.live import terminal
 from aacmm_jax.live.journal import Journal
 
 KIT = """
@@ -82,3 +83,12 @@ def test_however_a_capture_ends_its_poses_are_kept_and_the_terminal_is_as_before
     if end == "auxxsf":
         assert events == ["begin", "undo", "exclude", "exclude", "mark", "finished"]
         assert aj.files.load_capture(tmp_path / "c.h5").nominal.arm.joints == 6
+
+
+@pytest.mark.parametrize(
+    ("typed", "key"), [("x", "x"), ("\x03", "q"), ("\xe0Hs", "s"), ("\x00;\xe0M ", " "), ("\xe0K\x03", "q")]
+)
+def test_arrows_of_the_console_of_windows_are_not_letters_and_ctrl_c_ends(typed, key):
+    characters = iter(typed)
+    assert terminal._console_key(lambda: next(characters)) == key
+    assert not [*characters]

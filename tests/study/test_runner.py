@@ -5,12 +5,15 @@ import os
 import signal
 import time
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
 
 import jax
 import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.core._compat import reset_compilation_cache
+from aacmm_jax.files.outputs import OutputFile
+from aacmm_jax.study import runner
 from aacmm_jax.study.runner import use_compilation_cache
 from aacmm_jax.study.store import parts_of
 
@@ -130,3 +133,15 @@ def test_nobody_answers(aacmm, home, monkeypatch):
     done = aacmm("study", home / "spec.toml", "-o", "s.h5", "--dask", "tcp://127.0.0.1:1", expect=2)
     assert done.stderr.count("\n") == 1
     assert "no Dask scheduler answers at tcp://127.0.0.1:1; start a scheduler, or omit --dask" in done.stderr
+
+
+def test_a_lock_that_cannot_be_removed_while_it_is_held_is_left(tmp_path, monkeypatch):
+    """As on Windows, where the lock removes its file itself when it is released."""
+
+    def refuse(self, missing_ok=False):
+        raise PermissionError(13, "in use")
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    for _ in range(2):
+        with runner._locked(OutputFile(tmp_path / "study.h5")):
+            pass

@@ -5,6 +5,7 @@ The target is one of the kit; corners are found as in images (`camera.detect`).
 
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,9 @@ from ..places import Setup
 from ..samples import Sample
 from .device import AbstractDevice, numbers_of
 from .lines import RETRY
+
+_BUFFERED = 10  # images at most that a camera holds ready
+_WAITED = 0.004  # s that it takes to get an image that was not ready
 
 
 def open_device(where: str, options: Mapping[str, str], setup: Setup) -> "Camera":
@@ -37,6 +41,7 @@ class Camera(AbstractDevice):
         if not 0 < rate <= 100:
             raise InputError(f"device 'camera:{where}' has rate={rate:g}; give a number above 0 and at most 100.")
         self._where, self._target, self._period = where, target, 1 / rate
+        self._is_file = Path(where).is_file()
         self._capture: Any = None
         self._due = self._retry_at = 0.0
 
@@ -52,15 +57,15 @@ class Camera(AbstractDevice):
                 return []
             self._capture = cv2.VideoCapture(int(self._where) if self._where.isdecimal() else self._where)
             self._retry_at = now + RETRY
-        grabbed, image = self._capture.read() if self._capture.isOpened() else (False, None)
-        if not grabbed or image is None:
+        if not self._newest(now):
             self.close()
             self._retry_at, self.message = now + RETRY, "no image; trying again"
             return []
         self.connected, self.message = True, ""
         if now < self._due:
             return []
-        self._due, self.lines = now + self._period, self.lines + 1
+        self._due, self.lines, seen_at = now + self._period, self.lines + 1, time.monotonic()
+        _, image = self._capture.retrieve()
         try:
             found = detect(np.asarray(image).mean(axis=2).astype(np.uint8), self._target)
         except InputError as error:
@@ -70,7 +75,18 @@ class Camera(AbstractDevice):
             self.bad["target not found"] += 1
             self.message = found.refused
             return []
-        return [Sample(now, None, {}, {"corners": found.corners, "ids": found.ids})]
+        seen = {"corners": found.corners, "ids": found.ids}
+        return [Sample(now, None, {}, seen, time.monotonic() - seen_at)]
+
+    def _newest(self, now: float) -> bool:
+        """Go on to the newest image, past those that waited while the last one was searched."""
+        for _ in range(1 if self._is_file or now < self._due else _BUFFERED):
+            began = time.monotonic()
+            if not self._capture.grab():
+                return False
+            if time.monotonic() - began > _WAITED:
+                break
+        return True
 
     def close(self) -> None:
         if self._capture is not None:
