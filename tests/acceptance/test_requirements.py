@@ -249,7 +249,7 @@ BROKEN = [
     ("asme", ASME[2], lambda m: bars(m, along(lambda n: (math.cos(n), math.sin(n), 0)), every), "not all in one plane"),
     ("asme", ASME[2], lambda m: bars(m, to_one_place, every), "scatter by 0.0 %"),
     ("asme", ASME[2], no_range, "measuring range"),
-    ("jjf", JJF, without_socket("S"), "10 poses"),
+    ("jjf", JJF, without_socket("socket/middle"), "10 poses"),
     ("jjf", JJF, lambda m: m._replace(lengths=m.lengths[1:]), "30 different positions are required (29 given)"),
 ]
 
