@@ -157,13 +157,15 @@ def plan(
         "Plan for the artefacts and instruments in this file, with their uncertainties, instead of sockets.",
         "FILE.toml",
     ),
-    acceptance: Literal["asme", "iso"] | None = option(
-        "Plan the poses of an acceptance test to ASME B89.4.22 or ISO 10360-12 instead of the poses of a calibration."
+    acceptance: Literal["jjf", "asme", "iso"] | None = option(
+        "Plan the poses of an acceptance test to JJF 1408, ASME B89.4.22 or ISO 10360-12 instead of those of a "
+        "calibration."
     ),
     sphere_mm: float = option("Diameter of the sphere of an acceptance test.", default=25.0),
     stylus_mm: float = option("Diameter of the probe's ball in an acceptance test.", default=6.0, min=0),
     bar_mm: list[float] | None = option(
-        "Length of an available bar for an acceptance test; give the option twice for asme, five times for iso."
+        "Length of an available bar for an acceptance test; give the option once for jjf, twice for asme, five times "
+        "for iso."
     ),
     range_mm: float | None = option(
         "Measuring range (a diameter) stated by the maker, for an acceptance test. Default: twice the reach.",

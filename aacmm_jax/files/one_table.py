@@ -11,7 +11,7 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..core.text import quoted, shorten
-from .patterns import fields_matched
+from .patterns import is_excluded, matching
 from .text_table import TextTable
 
 _FILE, _PARTS = "file", ("artefact", "position", "end")
@@ -49,7 +49,8 @@ class OneTable:
 
     def matches(self, pattern: str, exclude: Sequence[str] = ()) -> list[dict[str, str]]:
         """The values of the fields in braces, as of files that are in the table; none if no file matches."""
-        return fields_matched([f"{x}{_EXTENSION}" for x in dict.fromkeys(self._labels.tolist())], pattern, exclude)
+        files = [f"{label}{_EXTENSION}" for label in dict.fromkeys(self._labels.tolist())]
+        return matching(pattern, [file for file in files if not is_excluded(file, exclude)])
 
     def check_used(self) -> None:
         """Raise `InputError` for rows of a file that the manifest does not name."""

@@ -88,9 +88,9 @@ def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dic
         )
 
     paths = below("*".join(map(glob.escape, _FIELD.sub("\0", pattern).split("\0"))))
-    left_out = [path for path in paths if _is_excluded(path, exclude)]
+    left_out = [path for path in paths if is_excluded(path, exclude)]
     kept = [path for path in paths if path not in set(left_out)]
-    if values := fields_matched(kept, pattern):
+    if values := matching(pattern, kept):
         return values
     loose = re.compile(_expression(pattern, _ANYTHING))
     where = f"no file matches '{pattern}' in {folder}"
@@ -111,15 +111,9 @@ def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dic
     raise InputError(f"{where}" + (f"; similar names: {', '.join(alike)}" if alike else "") + "; check the path.")
 
 
-def _is_excluded(path: str, exclude: Sequence[str]) -> bool:
+def is_excluded(path: str, exclude: Sequence[str]) -> bool:
+    """Whether a path, or its name, matches one of these shell patterns."""
     return any(fnmatch.fnmatchcase(name, x) for x in exclude for name in (path, Path(path).name))
-
-
-def fields_matched(paths: Iterable[str], pattern: str, exclude: Sequence[str] = ()) -> list[dict[str, str]]:
-    """The values of the fields for each of these paths that the pattern matches."""
-    strict, names = re.compile(_expression(pattern, _WORD)), list(dict.fromkeys(_FIELD.findall(pattern)))
-    kept = (path for path in paths if not _is_excluded(path, exclude))
-    return [dict(zip(names, match.groups(), strict=True)) for path in kept if (match := strict.fullmatch(path))]
 
 
 def _expression(pattern: str, partial: str) -> str:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..acceptance.procedure import TOUCHED, Procedure, ProcedureItem
-from ..acceptance.standards import PLANNED
+from ..acceptance.standards import STANDARDS
 from ..core.errors import InputError
 from ..core.text import csv_text
 from ..core.units import DEG
@@ -210,7 +210,7 @@ def plan_manifest(
             joints = len(chain_of(plan.arm, names[0]).joints) if names else plan.arm.joints
             tables.append((item.table, _observation(item, joints) | ({"chain": names[0]} if names else {})))
     else:
-        entries, what = entries | {"acceptance": plan.standard}, what.format(PLANNED[plan.standard])
+        entries, what = entries | {"acceptance": plan.standard}, what.format(STANDARDS[plan.standard])
         stated = (
             f"measuring_range = {plan.measuring_range:.0f}   # mm: diameter of the measuring volume, as the maker "
             "states it"
@@ -245,7 +245,7 @@ def _of_procedure(procedure: Procedure) -> list[tuple[str, dict[str, Any]]]:
     tables: list[tuple[str, dict[str, Any]]] = []
     kinds = dict.fromkeys(item.name.split("/")[0] for item in procedure.sockets)
     for kind in kinds:
-        pattern = f"{kind}/{{zone}}" if kind == "spat" else f"{kind}/{{position}}/{{side}}"
+        pattern = f"{kind}/{{zone}}" if not kind.startswith("bar") else f"{kind}/{{position}}/{{side}}"
         tables.append(("socket", {"name": pattern, "file": f"{pattern}.csv"}))
     for kind in kinds:
         value = next((value for start, _, value in procedure.lengths if start.startswith(f"{kind}/")), None)

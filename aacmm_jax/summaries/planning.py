@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..acceptance.procedure import Procedure
-from ..acceptance.standards import PLANNED
+from ..acceptance.standards import STANDARDS
 from ..core.text import pluralise
 from ..data.noise import linear_encoder_mm
 from ..kinematics.robots import chains_taken
@@ -115,7 +115,7 @@ def procedure_summary(procedure: Procedure, arm: str) -> dict[str, Any]:
     return {
         "kind": "acceptance plan",
         "arm": arm,
-        "standard": PLANNED[procedure.standard],
+        "standard": STANDARDS[procedure.standard],
         **attributes(procedure, "poses", measuring_range_mm="measuring_range", measuring_range_stated="range_stated"),
         **attributes(procedure.reach, reach_mm="radius", shoulder_mm="shoulder"),
         "bars": [{"length_mm": value, "positions": count} for value, count in lengths.items()],
