@@ -48,7 +48,7 @@ def peer(name: str, script: str, **given: Any) -> dict[str, np.ndarray] | None:
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "in.npz", Path(folder) / "out.npz"
         np.savez(source, **given)
-        subprocess.run([python, HERE / "peers" / name / script, source, target], check=True, capture_output=True)
+        subprocess.run([python, HERE / "peers" / name / script, source, target], check=True, stdout=subprocess.DEVNULL)
         return dict(np.load(target))
 
 

@@ -268,7 +268,7 @@ def page(results: dict[str, Any]) -> str:
         "| | arm and data | held out | authors | nominal | D-H | default | predicted |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    present = [name for name in SETS if len(results.get(name, {})) == len(MODELS)]
+    present = [name for name, of in SETS.items() if complete(of, results.get(name, {}))]
     for number, name in enumerate(present, start=1):
         of, (plain, default) = SETS[name], ([*results[name][model].values()] for model in MODELS)
         nominal = shown(together(plain, "nominal")) + length(plain, "nominal_length")
@@ -294,6 +294,10 @@ def page(results: dict[str, Any]) -> str:
         lines += ["", *textwrap.wrap(f"**{number}. {of.title}.** {caveats}", 120), "", "```text"]
         lines += [*commands(of, of.groups[0], "default"), "```"]
     return "\n".join([*lines, "", *textwrap.wrap(NOT_HERE, 120)]) + "\n"
+
+
+def complete(of: Set, rows: dict[str, Any]) -> bool:
+    return all(set(of.groups) <= rows.get(model, {}).keys() for model in MODELS)
 
 
 def length(rows: list[dict[str, float]], key: str) -> str:

@@ -2,7 +2,7 @@
 
 Modules cannot be imported, functions and flags of `os` and `signal` are missing, and owners are not checked. What
 Windows does differently cannot be simulated: paths with drives, open files that cannot be removed or renamed, text mode
-of descriptors, signals, spawning. Child processes and the machinery of the tests keep what they have.
+of descriptors, signals, spawning. Child processes, the lock of files and `subprocess` have what they need.
 """
 
 import os
@@ -12,8 +12,8 @@ import sys
 MODULES = ("fcntl", "grp", "pwd", "resource", "termios", "tty")
 FUNCTIONS = {
     os: "chown fchmod fchown fork geteuid getuid getgid sched_getaffinity sched_setaffinity sysconf "
-    "O_CLOEXEC O_NOFOLLOW O_NONBLOCK",
-    signal: "ITIMER_PROF SIGKILL SIGPROF pthread_sigmask setitimer",
+    "O_CLOEXEC O_NOFOLLOW",
+    signal: "ITIMER_PROF SIGPROF pthread_sigmask setitimer",
 }
 
 

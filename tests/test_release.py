@@ -44,6 +44,7 @@ def test_a_version_is_written_wherever_it_is_stated(release, texts):
         release.HEADING.search(new["CHANGELOG.md"])[1],
     )
     assert {*versions} == {"9.0.0rc1"}
+    assert recipe["package"]["version"] == "${{ version }}"
     assert cited["date-released"] == DAY
     assert {described["datePublished"], release.HEADING.search(new["CHANGELOG.md"])[2]} == {"2027-01-31"}
     again = release.stated("9.0.0rc1", DAY, new)

@@ -20,7 +20,7 @@ from ..uncertainty.volume import sample_lengths
 from .geometry import LEFT_OR_RIGHT, elbow_sides, touch_directions, unit_rows
 from .metrics import BARS, LONGEST, SPAT_POSES, ZONES, bar_range
 from .results import percent
-from .standards import Planned
+from .standards import Standard
 
 # The tests of touched spheres: as an item names them, and as a manifest does.
 TOUCHED: dict[str, SphereTest] = {
@@ -31,6 +31,7 @@ TOUCHED: dict[str, SphereTest] = {
 _POINTS_TRIED, _STARTS, _RANDOM_TIPS, _RANDOM_BARS = 16, 48, 6000, 300
 _TILT = (0.6, 0.8)  # sine and cosine of the probe's angle from the vertical in an orientation
 _OUTSIDE = 0.02  # cosine of probe and normal above which the probe does not come through the sphere
+_JJF_POSES, _JJF_LENGTHS, _JJF_BAR = 70, 30, 300.0  # in a socket; positions of the bar; its length, mm
 _LONGEST_PLANNED = 0.68  # the longest bar of ISO 10360-12, as a part of the measuring range
 # Where the sphere of ISO 10360-12 is planned, once in each: fractions of half the range, the least poses that reach it,
 # and how far apart both are, as a part of the reach.
@@ -67,7 +68,7 @@ class Procedure(NamedTuple):
     """
 
     arm: Arm
-    standard: Planned
+    standard: Standard
     reach: Reach
     measuring_range: float  # diameter of the measuring volume, mm
     range_stated: bool  # whether it is the maker's; otherwise it is twice the reach
@@ -86,7 +87,7 @@ class Procedure(NamedTuple):
 @checked_arguments
 def plan_procedure(
     arm: Arm,
-    standard: Planned,
+    standard: Standard,
     *,
     above: float = 0.0,
     margin: float = math.radians(5),
@@ -98,18 +99,19 @@ def plan_procedure(
 ) -> Procedure:
     """Plan the poses of an acceptance test; a zone that the arm cannot reach is left out and named in ``left_out``.
 
-    Source: ASME B89.4.22-2004 (effective diameter, single-point articulation, volumetric) or ISO 10360-12:2016
-    (probing, articulated location, length error), stated from secondary sources. `InputError` where the arm cannot
-    take such a test.
+    Source: JJF 1408-2013 as used by Cheng et al. 2018, section 4 (single point, length), ASME B89.4.22-2004 (effective
+    diameter, single-point articulation, volumetric) or ISO 10360-12:2016 (probing, articulated location, length error),
+    stated from secondary sources. `InputError` where the arm cannot take such a test.
 
     Args:
         arm: The arm, not a batch.
-        standard: "asme" or "iso".
+        standard: "jjf", "asme" or "iso".
         above: Height in the base frame below which no joint and no tip comes (the table), mm.
         margin: Distance of the joints from their limits, rad.
         diameter: Diameter of the sphere, mm.
         stylus: Diameter of the probe's ball, mm.
-        bars: Lengths of the available bars, mm: two for "asme", five for "iso"; suitable ones by default.
+        bars: Lengths of the available bars, mm: one for "jjf", two for "asme", five for "iso"; by default suitable
+            ones.
         measuring_range: Diameter of the measuring volume as the maker states it, mm; by default twice the reach.
         seed: Seed of the search.
 
@@ -132,7 +134,9 @@ def plan_procedure(
             f"a measuring range of {size:g} mm does not suit a reach of {reach.radius:.0f} mm; give the diameter of "
             "the measuring range in mm."
         )
-    if standard == "asme":
+    if standard == "jjf":
+        default = [round(min(_JJF_BAR, size / 4))]
+    elif standard == "asme":
         default = [round(float(np.mean(bar)) * size / 2) for bar in BARS]
     else:
         default = [round(_LONGEST_PLANNED * size * number / 5) for number in range(1, 6)]
@@ -143,7 +147,9 @@ def plan_procedure(
         )
     planner = _Planner(search, reach._replace(radius=size / 2), diameter, stylus)
     left_out = [] if bars is None else _unsuitable_bars(standard, size, lengths)
-    if standard == "asme":
+    if standard == "jjf":
+        planner.plan_jjf(lengths[0])
+    elif standard == "asme":
         left_out += planner.plan_asme(lengths)
     else:
         planner.plan_iso(lengths)
@@ -161,11 +167,13 @@ def plan_procedure(
     )
 
 
-def _unsuitable_bars(standard: Planned, size: float, lengths: Sequence[float]) -> list[str]:
+def _unsuitable_bars(standard: Standard, size: float, lengths: Sequence[float]) -> list[str]:
     if standard == "iso":
         least = LONGEST * size
         sentence = f"The longest bar, {lengths[-1]:g} mm, is shorter than 66 % of the measuring range ({least:.0f} mm)."
         return [sentence] if lengths[-1] < least else []
+    if standard == "jjf":  # the paper states no range of lengths
+        return []
     return [
         f"A bar of {length:g} mm is outside the required range of {bar_range(bar, size / 2)}."
         for bar, length in zip(BARS, lengths, strict=True)
@@ -186,6 +194,14 @@ class _Planner:
         self.touches: list[ProcedureItem] = []
         self.lengths: list[tuple[str, str, float]] = []
         self.spheres: list[PlannedSphere] = []
+
+    def plan_jjf(self, bar: float) -> None:
+        """A socket in the middle of the reach in 70 poses, and a bar in 30 positions."""
+        point, _ = self._socket_in_zone(ZONES[1], SPAT_POSES)
+        q, _ = configurations_at(self.search, point[None], 6 * _JJF_POSES)
+        q = q[_far_apart(q, _JJF_POSES)]
+        self.sockets.append(ProcedureItem("single point", "socket/middle", 1, np.tile(point, (len(q), 1)), q))
+        self._bar("bar1", bar, _JJF_LENGTHS, 1, "length")
 
     def plan_asme(self, bars: Sequence[float]) -> list[str]:
         """A socket in every zone that can be reached, three repeats on a sphere, and two bars in ten positions each;

@@ -10,8 +10,6 @@ if TYPE_CHECKING:
 
 JJF_1408, ASME_B89_4_22, ISO_10360_12 = "JJF 1408", "ASME B89.4.22", "ISO 10360-12"
 EDITIONS = {JJF_1408: "JJF 1408-2013", ASME_B89_4_22: "ASME B89.4.22-2004", ISO_10360_12: "ISO 10360-12:2016"}
-Planned = Literal["asme", "iso"]  # standards whose procedure can be planned, as arguments name them
-PLANNED: dict[Planned, str] = {"asme": ASME_B89_4_22, "iso": ISO_10360_12}
 Standard = Literal["jjf", "asme", "iso"]
 STANDARDS: dict[Standard, str] = {"jjf": JJF_1408, "asme": ASME_B89_4_22, "iso": ISO_10360_12}  # as options name them
 # The standard that a sphere was touched for, by its test.

@@ -305,7 +305,9 @@ def compare(
     ),
     csv: Path | None = option("Write every parameter of every calibration to this file (CSV).", "FILE"),
     max_length_change_mm: float | None = option(
-        "Exit with code 1 if a length changes by more than this from the first calibration to the last.", min=0
+        "Exit with code 1 if a length changes by more than this from the first calibration to the last. The next "
+        "calibration is due before lengths change by this; default: by U of their change.",
+        min=0,
     ),
     output: Path | None = output(
         "File to write the comparison to (HDF5); aacmm show and aacmm report read it.", "FILE.h5", None
@@ -331,7 +333,9 @@ def compare(
         settings = {"level": level, "length": length_mm, "labels": labels}
         trend = with_spinner("Comparing", lambda: _compared(records, created, settings))
         trend = trend._replace(dated_by_file=tuple(not records[i].recording.measured for i in trend.order))
-        summary: dict[str, Any] = words.compared_summary(trend, labels, records[0].recording.nominal.name)
+        summary: dict[str, Any] = words.compared_summary(
+            trend, labels, records[0].recording.nominal.name, max_length_change_mm
+        )
         summary["kept"], summary["failed"] = words.change_exceeded(trend.drifts[-1].lengths, max_length_change_mm)
         if figure is not None:
             plot.save_drift_trend(trend, figure)

@@ -93,9 +93,9 @@ def simulate(
         default=0.0,
         min=0,
     ),
-    acceptance: Literal["asme", "iso"] | None = option(
-        "Simulate the acceptance test to ASME B89.4.22 or ISO 10360-12 that 'aacmm plan --acceptance' plans, instead "
-        "of poses in sockets; the artefacts have u = 0.001 mm."
+    acceptance: Literal["jjf", "asme", "iso"] | None = option(
+        "Simulate the acceptance test to JJF 1408, ASME B89.4.22 or ISO 10360-12 that 'aacmm plan --acceptance' plans, "
+        "instead of poses in sockets; the artefacts have u = 0.001 mm."
     ),
     base: str | None = options.BASE_LINK,
     tip: list[str] | None = options.TIP_LINK,

@@ -13,7 +13,7 @@ from .. import files, kinematics, planning, summaries
 from ..core.errors import InputError
 from ..core.text import listed, number
 from ..core.units import DEG
-from ..files.inputs import ROBOT_FILES
+from ..files.inputs import ROBOT_FILES, fingerprint
 from ..files.outputs import together, write_text
 from . import options
 from .app import command, progress_bar, show_summary, with_spinner
@@ -26,7 +26,7 @@ _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 # Options that each way of planning takes besides those of all: of a calibration with sockets, of one with a kit, and
 # of an acceptance test.
 _OF_CHAINS = {"chain", "rest"}
-_OF_ALL = {"arm", "output", "manifest", "base", "tip", "seed", "as_json", "angles", "margin_deg", "above_mm"}
+_OF_ALL = {"arm", "output", "manifest", "page", "base", "tip", "seed", "as_json", "angles", "margin_deg", "above_mm"}
 _OF_CALIBRATIONS = {
     *("poses", "model", "held", "encoder_arcsec", "linear_encoder_mm", "seating_mm", "tool_axis", "retract_mm", "cell"),
     *("collisions", "link_radius_mm", "unconstrained", "criterion", "region", "candidates", "check_length_mm"),
@@ -37,7 +37,7 @@ _OF_ACCEPTANCE = {"acceptance", "sphere_mm", "stylus_mm", "bar_mm", "range_mm"}
 
 
 @command(
-    "aacmm plan my-arm.toml --sockets 4 --poses 30 -o plan.csv --manifest capture.toml",
+    "aacmm plan my-arm.toml --sockets 4 --poses 30 -o plan.csv --manifest capture.toml --page plan.html",
     "aacmm plan my-arm.toml --acceptance iso -o acceptance.csv --manifest acceptance.toml",
     "aacmm plan my-arm.toml -o plan.csv --poses 25 \\\n"
     "  --socket A=400,200,300 --socket B=700,500,500 --length A,B,0.002",
@@ -157,13 +157,15 @@ def plan(
         "Plan for the artefacts and instruments in this file, with their uncertainties, instead of sockets.",
         "FILE.toml",
     ),
-    acceptance: Literal["asme", "iso"] | None = option(
-        "Plan the poses of an acceptance test to ASME B89.4.22 or ISO 10360-12 instead of the poses of a calibration."
+    acceptance: Literal["jjf", "asme", "iso"] | None = option(
+        "Plan the poses of an acceptance test to JJF 1408, ASME B89.4.22 or ISO 10360-12 instead of those of a "
+        "calibration."
     ),
     sphere_mm: float = option("Diameter of the sphere of an acceptance test.", default=25.0),
     stylus_mm: float = option("Diameter of the probe's ball in an acceptance test.", default=6.0, min=0),
     bar_mm: list[float] | None = option(
-        "Length of an available bar for an acceptance test; give the option twice for asme, five times for iso."
+        "Length of an available bar for an acceptance test; give the option once for jjf, twice for asme, five times "
+        "for iso."
     ),
     range_mm: float | None = option(
         "Measuring range (a diameter) stated by the maker, for an acceptance test. Default: twice the reach.",
@@ -171,6 +173,10 @@ def plan(
     ),
     manifest: Path | None = option(
         "Write a manifest to this file; aacmm import reads the recorded readings with it.", "FILE.toml"
+    ),
+    page: Path | None = option(
+        "Write a page to take to the machine: a picture, the set-up, and the poses with a box to tick each (HTML).",
+        "FILE.html",
     ),
     base: str | None = options.BASE_LINK,
     tip: list[str] | None = options.TIP_LINK,
@@ -188,7 +194,7 @@ def plan(
 
     given = dict(locals())  # all options by name
     words, links = summaries.planning, {"base": base, "tip": tip}
-    with together(output, manifest):  # refuses outputs that are inputs or cannot be written, before the work
+    with together(output, manifest, page):  # refuses outputs that are inputs or cannot be written, before the work
         specification = files.load_specification(arm, base=base, tip=tip)
         if held is not None:
             fixed = options.names_option(held)
@@ -206,15 +212,23 @@ def plan(
     else:
         planned, stated = _planned(specification, given, links)
         summarise, view = (words.plan_summary, words.plan) if kit is None else (words.kit_plan_summary, words.kit_plan)
-    with together(output, manifest):
+    summary = summarise(planned, specification.name) | stated
+    with together(output, manifest, page):
         write_text(output, plan_csv(planned, angles, both_sides))
         if manifest is not None:
             # A manifest names the links with the arm; an arm file (TOML) names those of its URDF itself.
             urdf = specification.urdf if arm.lower().endswith(ROBOT_FILES) else None
             targets = () if kit is None else target_tables(kit)
             write_text(manifest, plan_manifest(planned, arm_for(manifest, arm), urdf, angles, targets))
-    written = f"{output}" if manifest is None else f"{output}, {manifest}"
-    show_summary(summarise(planned, specification.name) | stated | {"written": written}, as_json, view)
+        if page is not None:
+            from ..report import write_plan
+
+            sources = [fingerprint(arm)] if os.path.isfile(arm) else [f"{arm} (ships with aacmm)"]
+            sources += [] if kit is None else [fingerprint(kit)]
+            shown = {"angles": angles, "both_sides": both_sides, "sources": sources}
+            write_plan(page, planned, summary=summary, **shown)
+    written = ", ".join(str(path) for path in (output, manifest, page) if path is not None)
+    show_summary(summary | {"written": written}, as_json, view)
 
 
 def _check_options(context: Any, kit: bool, acceptance: bool) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ..core.arguments import checked_arguments
 from ..core.arrays import Numbers
@@ -159,6 +159,7 @@ class TriedPoses(NamedTuple):
 
     spacing: float  # within which 95 % of the calibration's poses have another one
     distance: Float[np.ndarray, " v"]  # of each other pose from the nearest one of the calibration
+    outside: Int[np.ndarray, " v"]  # how many joints of each are outside the travel that the calibration has of them
 
     @property
     def tried(self) -> Bool[np.ndarray, " v"]:
@@ -197,4 +198,7 @@ def tried_poses(arm: Arm, calibrated: Numbers, q: Numbers) -> TriedPoses:
         return distances
 
     chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _QUERIES)).round().astype(int))
-    return TriedPoses(float(np.quantile(nearest(poses[chosen], chosen), _NEAR)), nearest(others))
+    middle = np.where(turns, np.angle(np.mean(np.exp(1j * poses), axis=0)), 0.0)
+    apart, travel = (np.where(turns, (q - middle + np.pi) % (2 * np.pi) - np.pi, q) for q in (others, poses))
+    outside = np.sum((apart < travel.min(axis=0)) | (apart > travel.max(axis=0)), axis=1)
+    return TriedPoses(float(np.quantile(nearest(poses[chosen], chosen), _NEAR)), nearest(others), outside)

@@ -32,7 +32,7 @@ from .manifest_readings import Readings, points_of
 from .manifest_rows import Source, name_of, parts
 from .manifest_tables import TABLES, Length, PointsManifest, PosesManifest, Recorded, base_transform
 from .outputs import as_path
-from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches, matching
+from .patterns import check_fields, check_name, fields_of, fill, in_braces, matching
 from .reading_sets import other_readings, with_deviations
 from .toml import read_toml
 from .urdf_robots import joint_names, link_numbers
@@ -136,12 +136,12 @@ def _read(
         observed += [(seat.session, Socket(seat.name, seat.poses, target=seat.target)) for seat in others]
         cameras, images = Cameras(source, model.camera, model.target), list[ReadImage]()
         for entry in model.pixels:
-            for values in _fields(path.parent, entry, "pixels"):
+            for values in _fields(source, entry, "pixels"):
                 seen, read = observations_of(cameras, source, entry, values, detecting)
                 observed, images = [*observed, *seen], [*images, *read]
         for kind in TABLES:
             for number, entry in enumerate(() if kind is Socket else getattr(model, kind.table)):
-                for values in _fields(path.parent, entry, kind.table):
+                for values in _fields(source, entry, kind.table):
                     name = name_of(entry, values)
                     for part in parts(source, kind, entry, values, f"[[{kind.table}]] '{name}'"):
                         named = f"{name}/{part.group}" if entry.group is not None else name
@@ -153,6 +153,7 @@ def _read(
                             made, kept = MeasuredPoints, {entry.name for entry in MeasuredPoints.entries}
                             rows = {key: value for key, value in rows.items() if key in kept} | {"target": named}
                         observed.append((part.session, made.rebuilt(named, rows)))
+        source.check_used()
         if not observed:
             raise InputError("the manifest contains no [[socket]] and no other observation; add at least one.")
         probe = "remounted" if model.sessions is None else model.sessions.probe
@@ -258,6 +259,7 @@ def read_points(path: str | os.PathLike) -> Measured:
         source = Source(manifest, "points")
         source.rows = lambda text, wanted: points_of(text, wanted, stated)
         seated, lengths, spheres = _read_recorded(model, source)
+        source.check_used()
         for length in lengths:
             for end in (length.start, length.end):
                 if end not in seated:
@@ -294,11 +296,13 @@ def _read_recorded(
     model: Recorded, source: Source
 ) -> tuple[dict[str, _Seated], list[ReferenceLength], tuple[ProbedSphere, ...]]:
     """The sockets, lengths and spheres that a manifest names; names of sockets begin with their session."""
+    if model.measurements is not None:
+        source.put_in_place(model.measurements)
     sockets: dict[str, _Seated] = {}
     chains: set[tuple[str, str | None]] = set()
     fields: list[dict[str, str]] = []
     for entry in model.socket:
-        for values in _fields(source.folder, entry, "socket"):
+        for values in _fields(source, entry, "socket"):
             fields.append(values)
             stated = name_of(entry, values)
             named = "" if entry.name is None and entry.group is not None else stated
@@ -366,7 +370,7 @@ def _capture(lengths: Sequence[ReferenceLength], observed: Sequence[tuple[str, A
     return captures[""] if "" in captures else join_sessions(captures, own_probe=remounted)
 
 
-def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:
+def _fields(source: Source, entry: Any, table: str) -> Iterator[dict[str, str]]:
     """The values of the fields in braces of one entry, for all files that match; nothing in them where it has none."""
     if not entry.paths:
         yield {}
@@ -394,7 +398,7 @@ def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:
             f"exclude applies only to file names with a field in braces, but '{first}' has no such field; remove "
             "exclude."
         )
-    yield from matches(folder, first, entry.exclude) if fields else [{}]
+    yield from source.fields(first, entry.exclude) if fields else [{}]
 
 
 def _lengths(

@@ -18,7 +18,8 @@ from ..data.observations.declared import Declared, Entry
 from .inputs import InputFile, fingerprint
 from .manifest_files import PRESETS, Preset, as_list
 from .manifest_readings import Wanted, checked_unit
-from .patterns import check_name, fields_of, fill
+from .one_table import OneTable
+from .patterns import check_name, fields_of, fill, matches
 from .table_sources.sources import InputFolder, input_table, is_recording
 from .text_lines import TABLE_SHARE, Column
 from .text_table import TextTable
@@ -40,6 +41,7 @@ class Source:
         self.folder, self.quantity, self._files = Path(manifest).parent, quantity, [manifest]
         # Where a dictionary, rotations are left as the numbers of their table, whose unit it has for each table.
         self.rotation_units: dict[str, str | None] | None = None
+        self.whole: OneTable | None = None  # in place of files
         self.notes: dict[str, None] = {}  # what was read of files that are more than a table
 
     def open(self, path: str) -> InputFile:
@@ -47,8 +49,23 @@ class Source:
         self._files.append(InputFile(self.folder / path, TABLE_SHARE))
         return self._files[-1]
 
+    def put_in_place(self, path: str) -> None:
+        """Take the rows of one table in place of files."""
+        self.whole = OneTable(TextTable(self.open(path), decimal=None))
+
+    def check_used(self) -> None:
+        """Raise `InputError` where rows of the one table are of a file that the manifest does not name."""
+        if self.whole is not None:
+            self.whole.check_used()
+
+    def fields(self, pattern: str, exclude: Sequence[str]) -> list[dict[str, str]]:
+        """The values of the fields in braces for each file, or rows of the one table, that the pattern matches."""
+        return (self.whole and self.whole.matches(pattern, exclude)) or matches(self.folder, pattern, exclude)
+
     def table(self, path: str, **options: Any) -> TextTable:
         """Read another file, or folder, as a `TextTable` with these options."""
+        if self.whole is not None and path in self.whole:
+            return self.whole.rows(path)
         opened = input_table(self.folder / path, TABLE_SHARE)
         self._files += opened.files if isinstance(opened, InputFolder) else [opened]
         table = TextTable(opened, **options)

@@ -228,6 +228,7 @@ class Recorded(Strict):
     """What manifests of poses and of points have in common."""
 
     date: _Day | None = None  # day of the measurement
+    measurements: str | None = None  # one table with the rows of many files
     socket: list[SocketTable] = Field(default_factory=list)
     length: list[Length] = Field(default_factory=list)
     sphere: list[Sphere] = Field(default_factory=list)

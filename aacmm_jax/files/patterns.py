@@ -88,15 +88,11 @@ def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dic
         )
 
     paths = below("*".join(map(glob.escape, _FIELD.sub("\0", pattern).split("\0"))))
-    left_out = [
-        path for path in paths if any(fnmatch.fnmatchcase(name, x) for x in exclude for name in (path, Path(path).name))
-    ]
+    left_out = [path for path in paths if is_excluded(path, exclude)]
     kept = [path for path in paths if path not in set(left_out)]
-    names = list(dict.fromkeys(_FIELD.findall(pattern)))
-    strict, loose = (re.compile(_expression(pattern, partial)) for partial in (_WORD, _ANYTHING))
-    values = [dict(zip(names, match.groups(), strict=True)) for path in kept if (match := strict.fullmatch(path))]
-    if values:
+    if values := matching(pattern, kept):
         return values
+    loose = re.compile(_expression(pattern, _ANYTHING))
     where = f"no file matches '{pattern}' in {folder}"
     near = [f"'{path}'" for path in kept if loose.fullmatch(path)]
     if near:
@@ -113,6 +109,11 @@ def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dic
     files = [path for path in below(glob.escape(fixed) + "/" * bool(fixed) + deeper) if os.path.isfile(before + path)]
     alike = [f"'{path}'" for path in difflib.get_close_matches(pattern, files, n=_SHOWN, cutoff=0.3)]
     raise InputError(f"{where}" + (f"; similar names: {', '.join(alike)}" if alike else "") + "; check the path.")
+
+
+def is_excluded(path: str, exclude: Sequence[str]) -> bool:
+    """Whether a path, or its name, matches one of these shell patterns."""
+    return any(fnmatch.fnmatchcase(name, x) for x in exclude for name in (path, Path(path).name))
 
 
 def _expression(pattern: str, partial: str) -> str:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..acceptance.procedure import TOUCHED, Procedure, ProcedureItem
-from ..acceptance.standards import PLANNED
+from ..acceptance.standards import STANDARDS
 from ..core.errors import InputError
 from ..core.text import csv_text
 from ..core.units import DEG
@@ -166,6 +166,7 @@ def _file_of(procedure: Procedure, item: ProcedureItem) -> str:
 
 
 _ROWS = "(one row per pose, in the order of the plan{}), then run: aacmm import THIS.toml -o {}.h5"
+_ONE_TABLE = '# measurements = "THIS.csv"   # one table in place of the files, with the columns of the plan'
 _WHAT = {
     Plan: "Manifest of a planned calibration. Fill in the calibrated lengths and uncertainties (k = 1), record one "
     "file per socket " + _ROWS.format("", "capture"),
@@ -209,12 +210,12 @@ def plan_manifest(
             joints = len(chain_of(plan.arm, names[0]).joints) if names else plan.arm.joints
             tables.append((item.table, _observation(item, joints) | ({"chain": names[0]} if names else {})))
     else:
-        entries, what = entries | {"acceptance": plan.standard}, what.format(PLANNED[plan.standard])
+        entries, what = entries | {"acceptance": plan.standard}, what.format(STANDARDS[plan.standard])
         stated = (
             f"measuring_range = {plan.measuring_range:.0f}   # mm: diameter of the measuring volume, as the maker "
             "states it"
         )
-        size = [stated if plan.range_stated else f"# {stated} (the plan assumes twice the reach)"]
+        size = [_ONE_TABLE, stated if plan.range_stated else f"# {stated} (the plan assumes twice the reach)"]
         tables = _of_procedure(plan)
     beside = ["# date = 2026-01-31   # day of the measurement", *size, "", "[angles]", f'unit = "{angles}"']
     return manifest_text(what, entries, beside, tables)
@@ -244,7 +245,7 @@ def _of_procedure(procedure: Procedure) -> list[tuple[str, dict[str, Any]]]:
     tables: list[tuple[str, dict[str, Any]]] = []
     kinds = dict.fromkeys(item.name.split("/")[0] for item in procedure.sockets)
     for kind in kinds:
-        pattern = f"{kind}/{{zone}}" if kind == "spat" else f"{kind}/{{position}}/{{side}}"
+        pattern = f"{kind}/{{zone}}" if not kind.startswith("bar") else f"{kind}/{{position}}/{{side}}"
         tables.append(("socket", {"name": pattern, "file": f"{pattern}.csv"}))
     for kind in kinds:
         value = next((value for start, _, value in procedure.lengths if start.startswith(f"{kind}/")), None)

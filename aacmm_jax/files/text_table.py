@@ -1,6 +1,7 @@
 """Text tables: comma, semicolon, tab or blank between columns, header lines allowed; and tables of other formats."""
 
 import contextlib
+import copy
 import itertools
 import os
 import re
@@ -114,6 +115,13 @@ class TextTable:
         self.title = words[-1][1] if words else []  # a line of words that may not name the columns
         # Names of the columns; empty where the table has none.
         self.header = [name.strip("\"'") for name in names_of_columns(path, self.width, words, comments, wanted)]
+
+    def with_rows(self, kept: Sequence[int]) -> "TextTable":
+        """The same table with these rows alone, counted from 0."""
+        table = copy.copy(self)
+        table._lines, table._rows = [self._lines[i] for i in kept], [self._rows[i] for i in kept]
+        table.length = len(table._rows)
+        return table
 
     @property
     def misnamed(self) -> bool:

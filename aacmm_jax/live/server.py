@@ -27,7 +27,7 @@ from .messages import Allowance, action_of, as_json
 _FILES = {
     "/": ("index.html", "text/html"),
     "/page.js": ("page.js", "text/javascript"),
-    "/view.js": ("view.js", "text/javascript"),
+    "/view.js": ("../../plot/view.js", "text/javascript"),
     "/style.css": ("style.css", "text/css"),
 }
 _HEADERS = {

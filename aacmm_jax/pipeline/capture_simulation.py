@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..acceptance.procedure import plan_procedure, simulate_procedure
-from ..acceptance.standards import Planned
+from ..acceptance.standards import Standard
 from ..core.arguments import NotNegative, checked_arguments, with_options
 from ..core.arrays import Numbers
 from ..core.errors import InputError
@@ -37,7 +37,7 @@ class SimulationOptions(NamedTuple):
     noise: Noise | None = None
     resolution_arcsec: float | Sequence[float] = 0.0
     temperature: Numbers | None = None
-    acceptance: Planned | None = None
+    acceptance: Standard | None = None
     observations: Sequence[AbstractSimulated] = ()
     seed: int = 0
 
@@ -60,8 +60,8 @@ def simulate_capture(
         noise: standard deviations of readings and seat; by default none.
         resolution_arcsec: readings are rounded to multiples of it, as for `simulate`.
         temperature: of an arm with a thermometer, C, as for `simulate`.
-        acceptance: instead of sockets, the acceptance test of "asme" or "iso", as `acceptance.plan_procedure` plans it
-            for the nominal arm; artefacts have u = 0.001 mm.
+        acceptance: instead of sockets, the acceptance test of "jjf", "asme" or "iso", as
+            `acceptance.plan_procedure` plans it for the nominal arm; artefacts have u = 0.001 mm.
         observations: what else is recorded, as for `simulate`.
         seed: of the arm's errors, the poses and the noise.
 

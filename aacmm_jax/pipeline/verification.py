@@ -150,8 +150,8 @@ def verify(recording: Recording, delivered: ArmSpecification | Arm | None = None
     given = delivered if delivered is not None else recording.as_found
     if given is None:
         raise InputError(
-            "the delivered parameters are not given; name the controller's own file with --delivered, or as_found in "
-            "the manifest."
+            "the delivered parameters are not given; name the controller's own file with --delivered, or the nominal "
+            "arm, or as_found in the manifest."
         )
     nominal = recording.nominal.arm
     arm = given.arm if isinstance(given, ArmSpecification) else given

@@ -46,14 +46,15 @@ class Marks(NamedTuple):
     shade: Sequence[int] | np.ndarray | None = None  # of each mark or box, 0 to SHADES - 1, instead of the tone
     limits: tuple[float, ...] = ()  # of the shades, for the key
     unit: str = ""  # of the limits
+    classes: tuple[str, ...] = ()  # names of the shades instead of limits; empty for a shade that is not used
     box: tuple[float, float] = (1.0, 0.0)  # width and height of boxes; height 0: from the axis up to y
     joined: bool = False  # points with a line through them
 
     @property
     def shade_names(self) -> list[str]:
-        """The range of each shade in words."""
+        """The range of each shade in words, or its class."""
         if not self.limits:
-            return []
+            return [*self.classes]
         step = 1.01 * max(min(np.diff(self.limits)), 1e-9)  # so that 0.0999 has the decimals of 0.1
         whole = all(limit == round(limit) for limit in self.limits)
         decimals = 0 if whole else max(1 - int(np.floor(np.log10(step))), 0)

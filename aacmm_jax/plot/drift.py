@@ -1,5 +1,7 @@
 """Figures of drift: changes of parameters and of lengths between two calibrations, or over the dates of several."""
 
+import datetime
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +11,11 @@ from ..core.text import pluralise
 from ..drift.results import Drift, Trend, in_words
 from ..summaries.result_tables import listed_apart
 from ..uncertainty.coverage import in_percent
-from .charts import SERIES, Axis, Marks, Plot, histogram, linear, names
+from .charts import SERIES, Axis, Chart, Marks, Plot, histogram, linear, names
 from .figures import check_format, draw, new_figure, save_figure
 
 _CROWDED = 0.03  # calibrations nearer in time than this fraction of the whole are spaced evenly
+_ROOM = 0.08  # of an axis, between two dates
 _FAR = 8.0  # changes beyond so many expanded uncertainties need an axis that shortens what is far out
 _RATIO = "change / expanded uncertainty"
 
@@ -118,6 +121,39 @@ def _lengths_over_time(trend: Trend, x: Axis, positions: np.ndarray) -> Plot:
     )
     y = linear(f"change of {lengths[0].length:g} mm\nlengths [um]", *(part.y for part in marks), zero=True)
     return Plot(x, y, marks)
+
+
+def due_chart(trend: Trend, due: Mapping[str, Any] | None) -> Chart:
+    """RMS change of lengths over all calibrations, and until the next one is due (``due`` of a summary); mm."""
+    lengths, first = [drift.lengths for drift in trend.drifts], trend.dates[0]
+    days = np.array([(date - first) / datetime.timedelta(days=1) for date in trend.dates])
+    rms = np.array([0.0, *(length.rms for length in lengths)])
+    chance = np.array([np.nan, *(length.rms_by_chance for length in lengths)])
+    words = [f"{date:%Y-%m-%d}: {value:.4f} mm" for date, value in zip(trend.dates, rms.tolist(), strict=True)]
+    marks = [
+        Marks("RMS change of lengths", days, rms, "square", "main", words, joined=True, size=7),
+        Marks("expected from the uncertainties alone", days, chance, "ring", "soft"),
+    ]
+    labels = {float(day): f"{date:%Y-%m-%d}" for day, date in zip(days, trend.dates, strict=True)}
+    if due:
+        date = datetime.datetime.fromisoformat(due["date"])
+        day = (date - first) / datetime.timedelta(days=1)
+        rise = due["rate_mm_per_year"] / 365.25 * np.array([0.0, day])
+        marks += [
+            Marks("at the rate seen until now", [0.0, day], rise, "dashed", "accent"),
+            Marks("next calibration due", [day], rise[1:], "diamond", "accent", [f"{date:%Y-%m-%d}: due"]),
+        ]
+        labels[day] = f"{date:%Y-%m-%d}"
+    axis = linear("", [*labels], margin=0.05)
+    # The last dates first, as many as have room.
+    ticks: list[tuple[float, str]] = []
+    for at, label in sorted(labels.items(), reverse=True):
+        if not ticks or ticks[-1][0] - at > _ROOM * (axis.high - axis.low):
+            ticks.append((at, label))
+    axis = axis._replace(ticks=tuple(reversed(ticks)), named=True)
+    y = linear("RMS change [mm]", *(part.y for part in marks), zero=True)
+    says = f"Lengths of {lengths[0].length:g} mm over the working volume, by each calibration less the first."
+    return Chart("due", "Drift of the arm", says, (Plot(axis, y, tuple(marks), height=260),))
 
 
 def _changes_of_two(drift: Drift) -> Plot:

@@ -43,7 +43,7 @@ def draw(plot: Plot, axes: Any = None, size: tuple[float, float] = (6.4, 4.2), *
         axes.set_aspect("equal")
     handles, labels = axes.get_legend_handles_labels()
     if legend and labels:
-        title = "\n".join(filter(None, (plot.title, *(marks.name for marks in plot.marks if marks.limits))))
+        title = "\n".join(filter(None, (plot.title, *(marks.name for marks in plot.marks if marks.shade_names))))
         style = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "fontsize": 9, "title_fontsize": 9}
         axes.legend(handles, labels, ncols=_columns(labels), frameon=False, title=title, **style)
     elif plot.title:
@@ -134,7 +134,7 @@ def _draw_marks(axes: Any, marks: Marks) -> None:
         style |= {"linestyle": "-", "linewidth": marks.size / 4} if marks.joined else {}
         for i, color in enumerate(() if marks.shade is None else _SHADES):
             chosen = np.asarray(marks.shade) == i
-            shaded = {"color": color, "label": marks.shade_names[i] if marks.limits else None}
+            shaded = {"color": color, "label": marks.shade_names[i] or None if marks.shade_names else None}
             shaded |= {"markersize": 0.7 * (marks.size + 1.6 * i), "markeredgecolor": "0.5", "markeredgewidth": 0.4}
             axes.plot(x[chosen], y[chosen], **(style | shaded))
         if errors:

@@ -11,15 +11,24 @@ from ..core.errors import InputError
 from ..core.units import DEG
 from ..diagnostics.joint_travel import TriedPoses
 from ..summaries.calibration import metrics_by_socket_and_length
-from ..summaries.tables import decimals_for, format_number
+from ..summaries.tables import by_columns, decimals_for, format_number, numbers
 from ..uncertainty.coverage import U_AT_LEVEL
 from ..uncertainty.volume import VolumetricUncertainty
-from .charts import SHADES, Axis, Chart, Marks, Plot, borders, level, linear, names, runs, shades, thinned
+from .charts import Axis, Chart, Marks, Plot, borders, level, linear, names, runs, shades, thinned
 from .figures import draw
 
 _NAMED = 16  # most lengths or placements along an axis
 _LEAST = 1e-6  # mm: drawn for a limit of zero
 _ACROSS, _UP = "distance from the first axis [mm]", "height [mm]"
+# By their shade: how far from the poses of a calibration another pose is.
+_TRIED = (
+    "near a calibration pose",
+    "",
+    "farther, every joint within its calibrated travel",
+    "one joint outside its calibrated travel",
+    "",
+    "two joints or more outside",
+)
 _TIPS = 400  # most tips of the calibration that are drawn
 
 
@@ -125,8 +134,8 @@ def metrics_chart(tests: Sequence[AcceptanceTest]) -> Chart:
         metrics, y, lines, title = limited, "|value| / MPE", [1.0], "Metrics against their limits"
         divisors = np.array([max(metric.worst.limit or 0.0, _LEAST) for metric in metrics])
         description = (
-            "The value of each metric divided by its limit, with U. The decisions in the tables follow the decision "
-            "rule stated above, whose guard band may be smaller than U."
+            "The value of each metric divided by its limit, with U. The decisions in the tables follow their "
+            "decision rule, whose guard band may be smaller than U."
         )
     values = np.array([abs(metric.value) for metric in metrics]) / divisors
     bars = np.array([metric.worst.expanded for metric in metrics]) / divisors
@@ -198,33 +207,38 @@ def volumetric_uncertainty_map(volume: VolumetricUncertainty, axes: Any = None) 
 
 
 def tried_chart(volume: VolumetricUncertainty, tips: np.ndarray, poses: TriedPoses) -> Chart:
-    """Half a section through the volume: random poses by their distance from the nearest calibrated one, and the tips
-    of the calibration, mm."""
-    ratio = poses.distance / max(poses.spacing, 1e-12)
+    """Half a section through the volume: random poses by how far they are from what the calibration has, the tips of
+    the calibration, mm, and a table of the classes with U of a tip in each."""
+    shade = tried_shades(poses)
     said = [
-        f"{distance / DEG:.0f} deg from the nearest calibration pose, {times:.1f} times the spacing of these poses"
-        for distance, times in zip(poses.distance.tolist(), ratio.tolist(), strict=True)
+        f"{distance / DEG:.0f} deg from the nearest calibration pose; {_TRIED[i]}"
+        for distance, i in zip(poses.distance.tolist(), shade.tolist(), strict=True)
     ]
     tips = tips[thinned(len(tips), _TIPS)]
     across = np.hypot(tips[:, 0], tips[:, 1])
-    random = _section(volume.start, tried_shades(ratio), said, size=5)
+    random = _section(volume.start, (shade, ()), said, size=5, classes=_TRIED)
     marks = random, Marks("tips of the calibration", across, tips[:, 2], "square", "accent", size=4)
     axes = linear(_ACROSS, random.x, across, [0.0]), linear(_UP, volume.start[:, 2], tips[:, 2])
-    plot = Plot(*axes, marks, height=380)
-    description = (
-        "Tip positions of random poses over the whole volume. The size of a mark shows the distance in joint space "
-        "from the nearest calibration pose, in multiples of the spacing of the calibration poses. Random poses with a "
-        "distance of up to 1 are covered by the calibration."
+    parts = [(name, shade == i) for i, name in enumerate(_TRIED) if name]
+    u = [volume.expanded_tip[part] for _, part in parts]
+    table = by_columns(
+        "Random poses within the joint limits, by how far they are from the calibration",
+        {
+            "class": [name for name, _ in parts],
+            "share [%]": numbers([100 * float(np.mean(part)) for _, part in parts], 0),
+            "median U of a tip [mm]": numbers([float(np.median(values)) if len(values) else np.nan for values in u]),
+            "largest [mm]": numbers([float(np.max(values)) if len(values) else np.nan for values in u]),
+        },
     )
-    return Chart("tried", "Coverage of the working volume", description, (plot,))
+    description = (
+        "Tip positions of random poses over the whole volume. Near: no farther from a calibration pose than these are "
+        "from one another. Farther, within the travel that the calibration has of every joint, the model interpolates; "
+        "outside this travel it extrapolates."
+    )
+    plot = Plot(*axes, marks, height=380)
+    return Chart("tried", "Coverage of the working volume", description, (plot,), table)
 
 
-def tried_shades(ratio: np.ndarray) -> tuple[np.ndarray, tuple[float, ...]]:
-    """The shade of each multiple of the spacing: the first ends at 1, the others divide what is beyond."""
-    beyond = ratio > 1.0
-    if np.all(beyond) or not np.any(beyond):
-        return shades(ratio)
-    shade = np.zeros(len(ratio), dtype=int)
-    shade_beyond, limits = shades(ratio[beyond], SHADES - 1)
-    shade[beyond] = shade_beyond + 1
-    return shade, (0.0, 1.0, *limits[1:])
+def tried_shades(poses: TriedPoses) -> np.ndarray:
+    """The shade of each pose in `_TRIED`."""
+    return np.where(poses.tried, 0, np.array([2, 3, 5])[np.minimum(poses.outside, 2)])

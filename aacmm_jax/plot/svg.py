@@ -49,10 +49,15 @@ def drawn(plot: Plot, label: str) -> str:
 def key(plots: Sequence[Plot]) -> list[tuple[str, str]]:
     """The glyph and the name of every shade, and of every named series where there are others."""
     series = [marks for plot in plots for marks in plot.marks]
-    shades = {name: _box(f"boxes s{i}") for marks in series for i, name in enumerate(marks.shade_names)}
-    named = {marks.name: _glyph(marks) for marks in series if marks.name and not marks.limits}
+    shades = {words: box for marks in series for box, words in shade_keys(marks, "s")}
+    named = {marks.name: _glyph(marks) for marks in series if marks.name and not marks.shade_names}
     entries = shades | (named if shades or len(named) > 1 else {})
     return [(glyph, name) for name, glyph in entries.items()]
+
+
+def shade_keys(marks: Marks, name: str) -> list[tuple[str, str]]:
+    """The box and the range of each shade of marks, by the name of their colours."""
+    return [(_box(f"boxes {name}{i}"), words) for i, words in enumerate(marks.shade_names) if words]
 
 
 def points(plot: Plot) -> list[list]:

@@ -1,5 +1,5 @@
 """Reports for laboratories and their customers: one HTML file for a calibration, an evaluation, a study or
-compared models.
+compared models; and the page of a plan.
 
 Warnings and tables that the command line shows too are worded in `summaries`; figures for papers are in `plot`.
 """

@@ -10,6 +10,7 @@ from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_o
 from ..core.text import pluralise, shorten
 from ..diagnostics.determined import determined
 from ..diagnostics.findings import case_of
+from ..diagnostics.pose_residuals import rms
 from ..plot.lengths import length_chart
 from ..plot.residuals import arms_chart, distances_by_arm
 from ..summaries import result_tables
@@ -50,12 +51,15 @@ def calibration_report(record: CalibrationRecord) -> Report:
     joint = record.final_method == "joint"
     method = _OBSERVED if joint and capture.observations else _METHODS[record.final_method]
     robust = f", robust loss {record.robust}" if record.robust else ""
+    distances = distances_by_arm(record)
     return Report(
         title="Calibration of " + (record.recording.nominal.name or "an arm"),
         subtitle=f"{method}{robust}; {pluralise(summary['poses'], 'pose')} in {capture_words(capture)}",
         verdict=summary["verdict"]["says"],
         verdict_mark=summary["verdict"]["mark"],
         warnings=summary["warnings"],
+        numbers=_numbers(summary, distances),
+        picture=arms_chart(capture, distances, most=DRAWN),
         facts=_facts(summary),
         sections=[
             _data(record, summary),
@@ -77,16 +81,32 @@ def calibration_report(record: CalibrationRecord) -> Report:
     )
 
 
+def _numbers(summary: dict[str, Any], distances: dict[str, np.ndarray]) -> list[tuple[str, str, str]]:
+    """What the calibration changed, what lengths are measured to, and what held-out data or the scale say of it."""
+    before, after = (f"{rms(values[np.isfinite(values)]):.3g}" for values in distances.values())
+    numbers = [("RMS residual", f"{before} → {after} mm", "nominal → calibrated, poses of the calibration")]
+    stated, length = length_uncertainty(summary["uncertainty"]), summary["uncertainty"]["volume"]["length_mm"]
+    value, where, rest = (stated or "not determined everywhere").partition(" where ")
+    value, unit, everywhere = (value, "", where + rest) if where else value.partition(" mm")
+    numbers.append((f"U of a {length:g} mm length ({LEVEL_IN_PERCENT})", f"{value}{unit}", everywhere.strip()))
+    validated, held_out = summary["cross_validation"], summary.get("held_out_poses")
+    if validated is not None and validated["rms_mm"] is not None:
+        predicted = validated["rms_predicted_mm"]
+        note = "" if predicted is None else f"predicted {predicted:.3g} mm"
+        numbers.append(("Held-out groups, RMS distance", f"{validated['rms_mm']:.3g} mm", note))
+    elif held_out is not None:
+        numbers.append(("Held-out poses, RMS distance", f"{held_out['held_out']['rms_mm']:.3g} mm", ""))
+    else:
+        numbers.append(("Poses", f"{summary['poses']}", "none held out"))
+    return numbers
+
+
 def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
     nominal, calibrated, facts = summary["nominal"], summary["calibrated"], []
 
     def changed(before: float, after: float) -> str:
         return f"{format_number(before)} → {format_number(after)}\u00a0mm"
 
-    validated = summary["cross_validation"]
-    if validated is not None and validated["rms_mm"] is not None:
-        rms, predicted = format_number(validated["rms_mm"]), format_number(validated["rms_predicted_mm"])
-        facts.append(("Held-out groups, RMS distance", f"{rms}\u00a0mm (predicted {predicted})"))
     for key, name in (("de_mm", "DE"), ("deltam_mm", "Deltam")) if "de_mm" in calibrated else ():
         facts.append((f"{name}, nominal → calibrated", changed(nominal[key], calibrated[key])))
     if "held_out_poses" in summary:
@@ -98,9 +118,6 @@ def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
     for row in summary["kinds"][:_MOST_KINDS]:
         title = f"RMS residual, {row['kind']}, nominal → calibrated"
         facts.append((title, changed(row["rms_before_mm"], row["rms_after_mm"])))
-    stated = length_uncertainty(summary["uncertainty"])
-    length = f"{summary['uncertainty']['volume']['length_mm']:g} mm length with the noise of its readings"
-    facts.append((f"U of a {length} ({LEVEL_IN_PERCENT})", stated or "not determined everywhere"))
     if summary.get("lengths_tested"):
         facts.append(("Lengths tested", lengths_sentence(summary["lengths_tested"]).partition(": ")[2]))
     if summary["scale_k"] is not None:
@@ -186,7 +203,6 @@ def _nominal_and_calibrated(record: CalibrationRecord, summary: dict[str, Any]) 
             counts = pluralise(len(capture.names), "socket"), pluralise(len(capture.lengths), "reference length")
             caption = f"{counts[0]} measured with the arm's own probe, {counts[1]} [mm]"
         blocks.append(result_tables.metrics_table(caption, summary, stages, fixed_scale=record.fixed_by_one_length))
-    blocks.append(arms_chart(capture, distances_by_arm(record), most=DRAWN))
     if "truth" in summary:
         blocks.append(result_tables.truth_table(summary["truth"], stages))
     return Section("stages", "Nominal and calibrated arm", blocks)

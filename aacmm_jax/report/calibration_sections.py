@@ -9,7 +9,7 @@ from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord
 from ..core.units import DEG, people_read
 from ..diagnostics.joint_travel import tried_poses
-from ..diagnostics.pose_residuals import observation_residuals
+from ..diagnostics.pose_residuals import observation_residuals, signed_residuals
 from ..kinematics.arm import joint_limits, parameter_unit
 from ..model.sockets import pose_outliers
 from ..plot.cameras import coverage_chart, distortion_chart, images_of, picture_charts, residual_chart
@@ -37,7 +37,6 @@ from ..summaries.tables import (
     number,
     numbers,
     tried_sentence,
-    two_digits,
 )
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.coverage import LEVEL_IN_PERCENT
@@ -146,7 +145,11 @@ def arm_in_poses(record: CalibrationRecord, evaluation: Evaluation) -> Section:
     if record.sockets_alone:
         return Section("arm", "The arm in its poses", [view_of_arm(arm, capture, distances_in(capture, evaluation))])
     distances = np.concatenate([part.distance for part in observation_residuals(record)])
-    return Section("arm", "The arm in its poses", [view_of_arm(arm, capture, distances, record.observed.geometry)])
+    signed, vectors = signed_residuals(record), np.full((len(distances), 3), np.nan)
+    if signed is not None:
+        vectors[signed.poses] = signed.vector
+    view = view_of_arm(arm, capture, distances, record.observed.geometry, vectors)
+    return Section("arm", "The arm in its poses", [view])
 
 
 def volume(volume: VolumetricUncertainty, summary: dict[str, Any]) -> Section:
@@ -185,10 +188,6 @@ def coverage(record: CalibrationRecord, volume: VolumetricUncertainty) -> list[S
     summary = {"poses": len(poses.distance), "tried": int(poses.tried.sum()), "spacing_rad": poses.spacing}
     chart = tried_chart(volume, np.asarray(arm.position(readings)), poses)
     sentence = tried_sentence(summary)
-    medians = [float(np.median(volume.expanded_tip[part])) for part in (poses.tried, ~poses.tried) if np.any(part)]
-    if len(medians) == 2 and all(map(math.isfinite, medians)):
-        near, far = map(two_digits, medians)
-        sentence += f" The median U of a tip is {near} mm in the covered part and {far} mm outside this part."
     return [Section("tried", "Coverage of the working volume", [sentence, chart, _travel(record, readings)])]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from ..core.text import pluralise
 from ..drift.results import Drift, Trend
 from ..plot.charts import Chart
-from ..plot.drift import trend_plots
+from ..plot.drift import due_chart, trend_plots
 from ..summaries.drift import comparison_tables
 from .elements import Block, Report, Section
 
@@ -23,7 +23,7 @@ _CHANGED = (
 
 def comparison_report(summary: dict[str, Any]) -> Report:
     """The report of compared calibrations (`files.load_comparison`), except for the origin of its file."""
-    p, lengths = summary["joint"]["p"], summary["lengths"]
+    p, lengths, due = summary["joint"]["p"], summary["lengths"], summary.get("due")
     changed = p is not None and p < 1 - summary["level"]
     doubtful = p is None or changed or bool(summary["warnings"] or summary.get("failed"))
     tables: Any = comparison_tables(summary)  # and sentences
@@ -34,13 +34,17 @@ def comparison_report(summary: dict[str, Any]) -> Report:
         verdict=summary["answer"],
         verdict_mark="unsure" if doubtful else "good",
         warnings=[*summary["warnings"], *(f"Over the limit: {sentence}" for sentence in summary.get("failed", ()))],
-        facts=[
-            ("Parameters changed beyond U", f"{summary['moved']} of {summary['compared']}"),
-            (f"Lengths of {lengths['length_mm']:g} mm, RMS change", f"{lengths['rms_mm']:.4f}\u00a0mm"),
-            ("Largest change of a length", f"{lengths['largest_mm']:.4f}\u00a0mm"),
+        numbers=[
+            ("Parameters changed beyond U", f"{summary['moved']} of {summary['compared']}", ""),
+            (f"Lengths of {lengths['length_mm']:g} mm, RMS change", f"{lengths['rms_mm']:.4f}\u00a0mm", ""),
+            ("Next calibration due", due["date"][:10], f"before lengths change by {due['limit_mm']:.2g} mm")
+            if due
+            else ("Largest change of a length", f"{lengths['largest_mm']:.4f}\u00a0mm", ""),
         ],
+        picture=due_chart(_trend_of(summary), summary.get("due")),
+        facts=[],
         sections=[
-            Section("found", "What was found", list(summary["findings"])),
+            Section("found", "What was found", [*([due["says"]] if due else []), *summary["findings"]]),
             Section("changes", "Parameters and lengths", blocks),
         ],
     )

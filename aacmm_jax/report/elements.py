@@ -1,25 +1,29 @@
 """The elements of a report, independent of how they are shown; tables, charts and views of captures and evaluations."""
 
+import re
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import ConvexHull
 
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord
 from ..core.numpy_or_jax import AnyArray
 from ..core.units import people_read
 from ..data.capture import Capture
-from ..data.observations.observation import POINT, offset_of
+from ..data.observations.held import Artefact
+from ..data.observations.observation import POINT, AbstractObservation, offset_of
 from ..data.observations.pixels import Pixels
+from ..data.observations.touched import ParallelPlanes, Plane, Sphere
 from ..diagnostics.pose_residuals import distances_of, observation_residuals
 from ..kinematics.arm import Arm
-from ..kinematics.workspace import arm_reach, skeleton
+from ..kinematics.workspace import skeleton
 from ..model.sockets import pose_outliers
 from ..plot.cameras import shapes_of
-from ..plot.charts import Chart, thinned
+from ..plot.charts import Chart, Marks, shades, thinned
 from ..plot.residuals import Groups, distances_in, pose_chart
 from ..summaries.observations import capture_observations
 from ..summaries.result_tables import BY_CONSTRUCTION, with_u_digits
@@ -39,6 +43,13 @@ from ..summaries.tables import (
 
 DRAWN = 1000  # most poses in a chart
 _VIEWED = 150  # most poses in the view of the arm
+_HEADLINE = 90  # characters: a longer beginning of a verdict is no headline
+_LEGEND = {
+    "bar": "grey bars: certified lengths",
+    "plate": "grey areas: plates and faces",
+    "ball": "grey balls: what the tip was seated in or touched",
+    "sight": "orange lines: fields of view of cameras, and outlines of targets",
+}
 _NO_GEOMETRY: Mapping[str, Any] = {}
 
 
@@ -49,6 +60,13 @@ class ArmView(NamedTuple):
     title: str
     description: str
     data: dict[str, Any]
+    residuals: Marks  # whose shades colour the poses
+    legend: Sequence[str] = ()
+
+    @property
+    def enlarged(self) -> bool:
+        """Whether residuals are drawn as vectors."""
+        return any(pose.get("residual") for pose in self.data["poses"])
 
 
 Block = str | Table | Chart | ArmView
@@ -70,66 +88,121 @@ class Report(NamedTuple):
     verdict: str
     verdict_mark: str  # "good", "bad", "unsure", or "neutral" where nothing was decided
     warnings: list[str]
+    numbers: Sequence[tuple[str, str, str]]  # at most three: title, value, and what else is known of it
+    picture: Chart | ArmView | None  # beside verdict and numbers on the first screen
     facts: list[tuple[str, str]]
     sections: list[Section]
     simulated: bool = False
     decision: str | None = None  # of its acceptance tests, all together
     administrative: Sequence[tuple[str, list[tuple[str, str]]]] = ()  # groups of titles and values
 
+    @property
+    def headline(self) -> tuple[str, str]:
+        """The verdict in a few words, and the rest of it."""
+        for match in re.finditer("[:;.] ", self.verdict[:_HEADLINE]):
+            start, rest = self.verdict[: match.start()], self.verdict[match.end() :]
+            if start.count("(") == start.count(")"):
+                return start, rest[:1].upper() + rest[1:] if rest.split()[0].strip(".,;").isalpha() else rest
+        return self.verdict, ""
+
 
 def view_of_arm(
     arm: Arm,
     capture: Capture,
-    distances: Float[np.ndarray, " m"],
+    distances: Float[np.ndarray, " m"] | None = None,
     geometry: Mapping[str, Float[AnyArray, " _"]] = _NO_GEOMETRY,
+    residuals: Float[np.ndarray, "m 3"] | None = None,
 ) -> ArmView:
-    """The calibrated arm in the poses of a capture: marks at sockets and at the points of the geometry (centres,
-    pivots), and up to 150 poses as lines from joint to joint, mm, each with its residual (NaN where there is none).
+    """The arm in the poses of a capture: marks at sockets and at the points of the geometry (centres, pivots), bars,
+    plates, balls, cameras and targets, and up to 150 poses as lines from joint to joint, mm, each with its residual
+    (NaN where there is none) and its direction.
 
-    ``geometry`` has the parts of the unknown geometry, mm and rad, of a capture with observations besides sockets.
+    ``geometry`` has the parts of the unknown geometry, mm and rad, of a capture with observations besides sockets;
+    ``distances`` are None of poses that are planned; ``residuals`` are by default those of the sockets.
     """
     groups, q = Groups.of(capture), np.asarray(capture.readings)
     owner, labels, chosen = groups.owner, groups.labels, thinned(len(q), _VIEWED)
     tips = np.asarray(arm.position(capture.q))
     marks = {name: tips[capture.owner == i].mean(axis=0) for i, name in enumerate(capture.names)}
     lines, moving = skeleton(arm, q[chosen]), dict[int, np.ndarray]()
-    still: list[np.ndarray] = []
+    things = [_thing("bar", [marks[length.start], marks[length.end]]) for length in capture.lengths]
+    if residuals is None and not capture.observations:
+        residuals = tips - np.array([*marks.values()])[owner]
     for i, observation in enumerate(capture.observations, start=len(capture.names)):
         points = [part for part, units in observation.unknowns.items() if units == POINT]
         # A part with certified values has its numbers in a frame of its own.
-        marks |= {part: geometry[part] for part in points if part not in observation.certified}
-        if observation.target:
-            of_target = owner[chosen] == i
+        marks |= {part: geometry[part] for part in points if part not in observation.certified and part in geometry}
+        own, held = owner == i, arm
+        if observation.target and offset_of(observation.target) in geometry:
             held = arm.replace(probe=geometry[offset_of(observation.target)])
-            lines[of_target] = skeleton(held, q[chosen[of_target]])
-        if isinstance(observation, Pixels):
+            lines[own[chosen]] = skeleton(held, q[chosen[own[chosen]]])
+        things += _things_of(observation, np.asarray(held.position(q[own])), geometry)
+        if isinstance(observation, Pixels) and observation.frame in geometry:
             shapes, shape = shapes_of(arm, observation, geometry)
             moving |= dict(enumerate(shapes, start=int(np.searchsorted(owner, i))))
-            still.append(shape)
+            things.append(_thing("sight", shape))
             marks[observation.still] = geometry[observation.frame][3:]
-    data: dict[str, Any] = {
+    measured = np.full(len(q), np.nan) if distances is None else distances
+    shade, limits = shades(measured[chosen])
+    poses: list[dict[str, Any]] = []
+    for i, line, shown in zip(chosen, lines, shade.tolist(), strict=True):
+        pose = {"label": labels[i], "points": np.round(line, 1).tolist()}
+        pose["carried"] = np.round(moving.get(int(i), ()), 1).tolist()
+        if distances is not None:
+            finite = bool(np.isfinite(distances[i]))
+            pose |= {"distance": float(f"{distances[i]:.4g}") if finite else None, "shade": shown}
+            if residuals is not None and finite and np.all(np.isfinite(residuals[i])):
+                pose["residual"] = [float(f"{x:.3g}") for x in residuals[i]]
+        poses.append(pose)
+    data = {
         "marks": [{"name": name, "at": np.round(at, 1).tolist()} for name, at in marks.items()],
-        "lines": [np.round(line, 1).tolist() for line in still],
+        "things": things,
         "from": "geometry" if capture.observations else "socket's centroid",
-        "poses": [
-            {
-                "label": labels[i],
-                "points": np.round(line, 1).tolist(),
-                "carried": np.round(moving.get(int(i), ()), 1).tolist(),
-                "distance": float(f"{distances[i]:.4g}") if np.isfinite(distances[i]) else None,
-            }
-            for i, line in zip(chosen, lines, strict=True)
-        ],
-        "reach": round(arm_reach(arm).radius, 1),
+        "poses": poses,
     }
-    points = f", its {'points' if capture.observations else 'sockets'}" if marks else ""
-    return ArmView(
-        "scene",
-        f"The calibrated arm{points} and its poses",
-        "Drag, or use the arrow keys, to rotate the view; press plus or minus to zoom. The slider selects the pose."
-        + (" A pyramid is the field of view of a camera, a frame the outline of a target." if still else ""),
-        data,
-    )
+    drawn, sights = {thing["kind"] for thing in things}, any(len(pose["carried"]) for pose in poses)
+    legend = ["thick: the pose that the slider selects; grey lines: other poses"]
+    legend += [words for kind, words in _LEGEND.items() if kind in drawn or (kind == "sight" and sights)]
+    what = f"its {'points' if capture.observations else 'sockets'}, " if marks else ""
+    says = "Drag, or use the arrow keys, to rotate the view; press plus or minus to zoom. The slider selects the pose."
+    coloured = Marks("", (), (), limits=limits if distances is not None else (), unit="mm")
+    arm_words = "The calibrated arm" if distances is not None else "The arm"
+    return ArmView("scene", f"{arm_words}, {what}and its poses", says, data, coloured, legend)
+
+
+def _thing(kind: str, points: Any, **more: Any) -> dict[str, Any]:
+    return {"kind": kind, "points": np.round(np.asarray(points), 1).tolist(), **more}
+
+
+def _things_of(
+    observation: AbstractObservation, tips: Float[np.ndarray, "m 3"], geometry: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """What an observation touched, as far as the tips in it show: the bar or plate of an artefact, a ball, a face."""
+    if isinstance(observation, Artefact):
+        seats = [tips[observation.owner == point].mean(axis=0) for point in np.unique(observation.owner)]
+        balls = [_thing("ball", [seat]) for seat in seats] if len(seats) > 1 else []
+        named = {"name": observation.name}
+        if len(seats) == 2:
+            return [_thing("bar", seats, **named), *balls]
+        return [*([_thing("plate", _outline(np.array(seats)), **named)] if len(seats) > 2 else []), *balls]
+    if isinstance(observation, Sphere) and observation.geometry in geometry:
+        centre = np.asarray(geometry[observation.geometry])[:3]
+        return [_thing("ball", [centre], radius=float(np.median(np.linalg.norm(tips - centre, axis=1))))]
+    if isinstance(observation, Plane) and len(tips) > 2:
+        faces = [tips]
+        if isinstance(observation, ParallelPlanes):
+            faces = [tips[np.array(observation.side) == side] for side in dict.fromkeys(observation.side)]
+        return [_thing("plate", _outline(face)) for face in faces if len(face) > 2]
+    return []
+
+
+def _outline(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "h 3"]:
+    """The corners of the convex outline of points in the plane nearest to them, in their order around it."""
+    apart = points - points.mean(axis=0)
+    flat = apart @ np.linalg.svd(apart, full_matrices=False)[2][:2].T
+    if len(points) < 4 or np.linalg.matrix_rank(flat, tol=1.0) < 2:  # mm: a row of points has none
+        return points
+    return points[ConvexHull(flat).vertices]
 
 
 def socket_table(capture: Capture, evaluation: Evaluation) -> Table:

@@ -12,6 +12,7 @@ from ..calibration.evaluation import Evaluation
 from ..core.text import pluralise
 from ..data.capture import ReferenceLength
 from ..data.recording import ProbedSphere
+from ..plot.charts import Chart
 from ..plot.lengths import metrics_chart, reading_errors_chart
 from ..plot.residuals import arms_chart, distances_in
 from ..summaries import result_tables
@@ -24,6 +25,7 @@ from ..uncertainty.coverage import COVERAGE_FACTOR
 from .elements import DRAWN, Block, Report, Section, length_table, residual_chart, socket_table, view_of_arm
 
 _STAGES = ("nominal", "calibrated")
+_VALUES = "Every metric is the worst of several values."
 _GROUPS = (("held_out", "Held-out data"), ("identified_from", "Data used for identification"))
 _FACTS = {
     "observed_rms_mm": "RMS distance from the geometry",
@@ -43,7 +45,14 @@ def evaluation_report(record: EvaluationRecord) -> Report:
     sockets = [socket_table(capture, calibrated)] if capture.names else []
     residuals = [*sockets, *observation_tables(summary), residual_chart(capture, calibrated)]
     view = view_of_arm(arm, capture, distances_in(capture, calibrated), geometry)
-    tested = len(record.recording.spheres)
+    tested, facts = len(record.recording.spheres), _facts(summary)
+    distances = {stage: distances_in(capture, evaluations[stage]) for stage in _STAGES}
+    stages, picture = arms_chart(capture, distances, most=DRAWN), _margins(tests["calibrated"])
+    nominal_and_calibrated = _nominal_and_calibrated(record, summary)
+    if picture is None:
+        picture = stages
+    else:
+        nominal_and_calibrated.append(stages)
     return Report(
         title="Evaluation of " + (record.recording.nominal.name or "an arm"),
         subtitle=f"{pluralise(len(capture.readings), 'pose')} in {capture_words(capture)}"
@@ -55,10 +64,12 @@ def evaluation_report(record: EvaluationRecord) -> Report:
             *(f"Over the limit: {sentence}" for sentence in summary["failed"]),
             *(f"About the calibration: {sentence}" for sentence in record.calibration_warnings),
         ],
-        facts=_facts(summary),
+        numbers=_numbers(summary) or [(*fact, "") for fact in facts[:3]],
+        picture=picture,
+        facts=facts if summary["acceptance"] else facts[3:],
         sections=[
             *_acceptance(tests["calibrated"], summary, capture.lengths, record.recording.spheres),
-            Section("stages", "Nominal and calibrated arm", _nominal_and_calibrated(record, summary, evaluations)),
+            Section("stages", "Nominal and calibrated arm", nominal_and_calibrated),
             *_lengths(record, tests["calibrated"], evaluations),
             Section("residuals", "Residuals by observation and pose", residuals),
             Section("arm", "The arm in its poses", [view]),
@@ -89,6 +100,8 @@ def points_report(record: PointsRecord) -> Report:
         verdict=summary["verdict"]["says"],
         verdict_mark=summary["verdict"]["mark"],
         warnings=summary["warnings"],
+        numbers=_numbers(summary),
+        picture=_margins(tests),
         facts=[],
         sections=[
             *_acceptance(tests, summary, measured.lengths, measured.spheres),
@@ -161,8 +174,31 @@ def _acceptance(
             "standard": lambda row: row[2].standard,
         },
     )
-    chart = metrics_chart(tests)._replace(table=every, printed=limited)
-    return [Section("acceptance", "Acceptance tests", [*blocks, chart, *artefacts])]
+    values = Chart("values", "Values", _VALUES, (), every, printed=limited)
+    return [Section("acceptance", "Acceptance tests", [*blocks, values, *artefacts])]
+
+
+def _margins(tests: list[AcceptanceTest]) -> Chart | None:
+    """The metrics against their limits, if there are any."""
+    return metrics_chart(tests) if tests else None
+
+
+def _numbers(summary: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """The three metrics that use most of their limit; without limits, the first three."""
+    metrics = [metric for test in summary["acceptance"] for metric in test["figures"]]
+    metrics.sort(key=lambda metric: -_used(metric))  # stable
+    return [
+        (
+            metric["name"],
+            f"{format_number(metric['value_mm'])}\u00a0mm",
+            "no limit" if metric["limit_mm"] is None else f"limit {metric['limit_mm']:.3g} mm: {metric['decision']}",
+        )
+        for metric in metrics[:3]
+    ]
+
+
+def _used(metric: dict[str, Any]) -> float:
+    return 0.0 if not metric["limit_mm"] else abs(metric["value_mm"]) / metric["limit_mm"]
 
 
 def _artefacts(lengths: Sequence[ReferenceLength], spheres: Sequence[ProbedSphere]) -> list[Table]:
@@ -182,18 +218,13 @@ def _artefacts(lengths: Sequence[ReferenceLength], spheres: Sequence[ProbedSpher
     return [listed("Artefacts", rows, columns)] if rows else []
 
 
-def _nominal_and_calibrated(
-    record: EvaluationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation]
-) -> list[Block]:
+def _nominal_and_calibrated(record: EvaluationRecord, summary: dict[str, Any]) -> list[Block]:
     stages = {stage: words for stage, words in result_tables.STAGES.items() if stage != "stage1"}
     blocks: list[Block] = [
         result_tables.metrics_table(f"{title} [mm]", rows, stages, fixed_scale=rows["fixed_by_one_length"])
         for group, title in _GROUPS
         if (rows := summary[group]) is not None
     ]
-    capture = record.recording.capture
-    distances = {stage: distances_in(capture, evaluations[stage]) for stage in _STAGES}
-    blocks.append(arms_chart(capture, distances, most=DRAWN))
     if record.used:
         used = ", ".join(sorted(record.used))
         blocks.append(f"The calibration used: {used}. All other data were held out.")

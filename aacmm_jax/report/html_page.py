@@ -3,18 +3,23 @@
 import base64
 import hashlib
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..acceptance.procedure import Procedure
 from ..acceptance.record import SIMULATED
 from ..core.errors import require
 from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity
-from ..files.hdf5 import read_summary, read_tables
+from ..files.hdf5 import provenance, read_summary, read_tables
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together, write_text
+from ..files.plans import Angles
+from ..planning.design import Plan
+from ..planning.kit import KitPlan
 from ..plot.charts import Chart
-from ..plot.svg import drawn, key, points
+from ..plot.svg import drawn, key, points, shade_keys
+from ..summaries import planning
 from ..summaries.tables import Cell, Table
 from .elements import ArmView, Report
 
@@ -44,6 +49,11 @@ _ROWS: dict[str, tuple[tuple[str, str, str, bool], ...]] = {
         ("certificate", "place", "Place", False),
         ("certificate", "remarks", "Remarks", False),
     ),
+}
+_PLANS: dict[type, tuple[Any, Any]] = {
+    Plan: (planning.plan_summary, planning.plan),
+    KitPlan: (planning.kit_plan_summary, planning.kit_plan),
+    Procedure: (planning.procedure_summary, planning.procedure),
 }
 _ADDRESS = ("street", "postal_code", "city", "country", "email", "phone")
 
@@ -82,11 +92,58 @@ def write_report(
             needed = "" if kind == "evaluation" else "write the report of an evaluation with limits"
             check_conformity(administrative_data, simulated=report.simulated, decision=report.decision, needed=needed)
             report = report._replace(administrative=_administrative(administrative_data))
-        page = _render(report, _origin(read, attributes))
-        write_text(target, page)
+        return _written(report, _origin(read, attributes), target) | {"of": str(source)}
+
+
+def write_plan(
+    target: str | os.PathLike,
+    planned: Plan | KitPlan | Procedure,
+    arm: str = "",
+    *,
+    summary: dict[str, Any] | None = None,
+    angles: Angles = "deg",
+    both_sides: bool = False,
+    sources: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Write the page of a plan, to be taken to the machine, as one HTML file: a picture, what to put where, what it
+    achieves, and the poses in their order, with a box to tick.
+
+    Returns title, verdict, warnings and size of the page. `InputError` if the target cannot be written, or Jinja is not
+    installed.
+
+    Args:
+        target: The HTML file to write, whole or not at all.
+        planned: The plan of a calibration (`planning.plan`, `planning.plan_kit`) or of an acceptance test
+            (`acceptance.plan_procedure`).
+        arm: What the arm is called.
+        summary: What ``aacmm plan --json`` prints of the plan; by default without the source of the noise.
+        angles: Unit of the joint readings, "deg" or "rad".
+        both_sides: Whether every pose is taken twice, as in `files.save_plan`.
+        sources: Names and digests of the files that the plan was made from.
+
+    Example:
+        >>> plan = aj.planning.plan(arm, sockets={"A": (400, 200, 300)}, poses=12, noise=noise, candidates=200)
+        >>> written = aj.report.write_plan("plan.html", plan, "my arm")
+        >>> print(written["title"])
+        Plan of a calibration, my arm
+    """
+    require("report", "a page")
+    from ..files.plans import plan_csv
+    from .plans import plan_report
+
+    summarise, view = _PLANS[type(planned)]
+    shown = summarise(planned, arm) if summary is None else summary
+    with together(target):
+        report = plan_report(planned, shown, view(shown), plan_csv(planned, angles, both_sides))
+        attributes = provenance("plan") | {"sources": list(sources) or ["none"]}
+        return _written(report, _origin(None, attributes), Path(target))
+
+
+def _written(report: Report, origin: list[tuple[str, list[str]]], target: Path) -> dict[str, Any]:
+    page = _render(report, origin)
+    write_text(target, page)
     return {
         "kind": "report",
-        "of": str(source),
         "title": report.title,
         "verdict": report.verdict,
         "warnings": report.warnings,
@@ -123,12 +180,12 @@ def _report_of(kind: str, source: str | os.PathLike, attributes: dict[str, Any])
     return models_report(load_compared_models(source))
 
 
-def _origin(source: str | os.PathLike, attributes: dict[str, Any]) -> list[tuple[str, list[str]]]:
+def _origin(source: str | os.PathLike | None, attributes: dict[str, Any]) -> list[tuple[str, list[str]]]:
     """How the file was made, and how to reproduce it."""
     seed = attributes.get("seed")
+    measured = str(attributes.get("measured") or "not stated")
     return [
-        ("File", [fingerprint(source)]),
-        ("Measured on", [str(attributes.get("measured") or "not stated")]),
+        *([] if source is None else [("File", [fingerprint(source)]), ("Measured on", [measured])]),
         ("Created on", [str(attributes["created"])]),
         ("Command", [str(attributes["command"])]),
         ("aacmm_jax", [str(attributes["package_version"])]),
@@ -148,8 +205,9 @@ def _render(report: Report, origin: list[tuple[str, list[str]]]) -> str:
     template = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     ).from_string(read("page_template.html"))
-    script = read("page_script.js")
-    blocks = [block for section in report.sections for block in section.blocks]
+    # The engine that draws the arm is a module of the live page.
+    script = read("../plot/view.js").replace("export class", "class") + read("page_script.js")
+    blocks = [report.picture, *(block for section in report.sections for block in section.blocks)]
     return template.render(
         report=report,
         origin=origin,
@@ -160,14 +218,25 @@ def _render(report: Report, origin: list[tuple[str, list[str]]]) -> str:
         stacked_table=_stacked,
         numbers=lambda cells, headings: [any(row[i].value is not None for row in cells) for i in range(len(headings))],
         keys=lambda chart: key(chart.plots),
-        points={block.id: [points(plot) for plot in block.plots] for block in blocks if isinstance(block, Chart)},
+        # On paper instead of pages of digests: what the list of all sources, as it is on the screen, hashes to.
+        digest=lambda values: f"{len(values)} files; SHA-256 of this list, a line each: {_digest(values)}",
+        points={
+            block.id: [points(plot) for plot in block.plots]
+            for block in blocks
+            if isinstance(block, Chart) and block.plots
+        },
         scenes={block.id: block.data for block in blocks if isinstance(block, ArmView)},
+        shade_keys=shade_keys,
         style=read("page_style.css"),
         script=script,
         mark=hashlib.sha256(repr(origin).encode()).hexdigest()[:12],
         # The source expression by which the page's content security policy allows its own script.
         allowed="sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     )
+
+
+def _digest(lines: list[str]) -> str:
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
 def _stacked(table: Table, cells: list[list[Cell]]) -> bool:

@@ -37,8 +37,8 @@
     });
   }
 
-  // Lists of files and the tables of parts are collapsed on the screen and open on paper.
-  const folded = () => [...document.querySelectorAll(".origin details:not([open]), details[data-print]:not([open])")];
+  // The tables of parts are collapsed on the screen and open on paper.
+  const folded = () => [...document.querySelectorAll("details[data-print]:not([open])")];
   let opened = [];
   window.addEventListener("beforeprint", () => { opened = folded(); for (const one of opened) one.open = true; });
   window.addEventListener("afterprint", () => { for (const one of opened) one.open = false; });
@@ -92,146 +92,88 @@
     });
   }
 
-  // The arm: lines in space, rotated about the vertical and tilted, as SVG, which prints and scales.
-  const SVG = "http://www.w3.org/2000/svg";
-  function scene(container) {
-    const { marks, lines, from, poses, reach } = parsed("scenes")[container.dataset.scene];
-    const view = { turn: -0.9, tilt: 0.45, size: 1, pose: 0 };
-    const svg = document.createElementNS(SVG, "svg");
-    svg.setAttribute("role", "img");
-    svg.setAttribute("aria-label", container.getAttribute("aria-label"));
-    container.append(svg);
-    const all = [[0, 0, 0], ...marks.map((mark) => mark.at), ...lines.flat(),
-      ...poses.flatMap((p) => [...p.points, ...p.carried])];
-    const middle = [0, 1, 2].map((i) => (Math.min(...all.map((p) => p[i])) + Math.max(...all.map((p) => p[i]))) / 2);
-    const extent = Math.max(...all.map((p) => Math.hypot(...p.map((x, i) => x - middle[i]))), 1);
-    // Not every so many: the chains of a robot may take turns.
-    const shadows = poses.filter((_, i) => (0.618034 * i) % 1 < 24 / poses.length);
+  // The arm: drawn by the engine that the live page uses.
+  class SvgPen {
+    constructor(container) {
+      this.immediate = true; // so that what is printed is drawn before
+      container.insertAdjacentHTML("beforeend", '<svg aria-hidden="true"></svg>');
+      this.svg = container.lastElementChild;
+      this.measure = document.createElement("canvas").getContext("2d");
+      this.measure.font = FONT;
+    }
 
-    function add(name, attributes, text) {
-      const node = document.createElementNS(SVG, name);
-      for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
-      if (text !== undefined) node.textContent = text;
-      svg.append(node);
-      return node;
+    begin(width, height) {
+      this.svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+      this.parts = [];
     }
-    function project(point) {
-      const [x, y, z] = point.map((value, i) => value - middle[i]);
-      const c = Math.cos(view.turn), s = Math.sin(view.turn), ct = Math.cos(view.tilt), st = Math.sin(view.tilt);
-      const across = c * x - s * y, away = s * x + c * y;
-      const width = container.clientWidth || 640, height = container.clientHeight || 480;
-      const scale = (view.size * 0.48 * Math.min(width, height)) / extent;
-      return [width / 2 + scale * across, height / 2 - scale * (ct * z + st * away), ct * away - st * z];
+
+    #draw(name, attributes, style, text = "") {
+      const given = Object.entries(attributes).map(([key, value]) => `${key}="${value}"`).join(" ");
+      this.parts.push(`<${name} ${given} style="${style}">${text}</${name}>`);
     }
-    const path = (points) => points.map((p) => project(p).slice(0, 2).map((x) => x.toFixed(1)).join(",")).join(" ");
-    function render() {
-      const width = container.clientWidth || 640, height = container.clientHeight || 480;
-      svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
-      svg.replaceChildren();
-      // The base plane: circles about the first axis at fractions of the reach, and the axes of the base.
-      for (const fraction of [0.25, 0.5, 0.75, 1]) {
-        const angles = Array.from({ length: 73 }, (_, i) => (i * Math.PI) / 36);
-        const ring = angles.map((angle) => [fraction * reach * Math.cos(angle), fraction * reach * Math.sin(angle), 0]);
-        add("polyline", { points: path(ring), class: "ring-line" });
-      }
-      for (const [axis, name] of [[[1, 0, 0], "x"], [[0, 1, 0], "y"], [[0, 0, 1], "z"]]) {
-        const end = axis.map((v) => v * 0.3 * reach);
-        const points = path([[0, 0, 0], end]);
-        add("polyline", { points, class: "base-axis" });
-        const [x, y] = project(axis.map((v) => v * 0.34 * reach));
-        add("text", { x, y, class: "base-name" }, name);
-      }
-      for (const pose of shadows) {
-        add("polyline", { points: path(pose.points), class: "other-pose" });
-        add("polyline", { points: path(pose.carried), class: "other-pose" });
-      }
-      for (const line of lines) add("polyline", { points: path(line), class: "instrument" });
-      const now = poses[view.pose];
-      add("polyline", { points: path(now.points), class: "this-pose" });
-      add("polyline", { points: path(now.carried), class: "instrument" });
-      for (const point of now.points) {
-        const [cx, cy] = project(point);
-        add("circle", { cx, cy, r: 4, class: "joint" });
-      }
-      label(marks.map(({ name, at }) => [name, ...project(at)]), width, height);
-      container.dataset.turn = view.turn.toFixed(3);
-      container.dataset.tilt = view.tilt.toFixed(3);
-      container.dataset.drawn = "yes";
+
+    #points(points) {
+      return points.map(([x, y]) => `${x.toFixed(1)},${y.toFixed(1)}`).join(" ");
     }
-    // Names beside their marks, from the top down, each in the first free place around its mark;
-    // where there is none, the mark has no name but is drawn.
-    function label(projected, width, height) {
-      const taken = projected.map(([, x, y]) => [x - 7, y - 7, x + 7, y + 7]), line = 16;
-      const free = (box) => box[0] >= 2 && box[1] >= 2 && box[2] <= width - 2 && box[3] <= height - 2 &&
-        !taken.some((other) => box[0] < other[2] && other[0] < box[2] && box[1] < other[3] && other[1] < box[3]);
-      for (const [name, x, y] of [...projected].sort((one, other) => one[2] - other[2])) {
-        add("path", { d: `M${x - 6},${y}h12M${x},${y - 6}v12`, class: "mark" });
-        const text = add("text", { x, y, class: "mark-name" }, name), wide = text.getComputedTextLength() + 4;
-        const places = [];
-        for (const far of [0, 1, 2, 3, 4, 5, 6]) {
-          for (const side of [1, -1]) {
-            for (const way of [-1, 1]) {
-              const left = side > 0 ? x + 9 : x - 9 - wide, middle = y + way * (far ? 6 + far * line : 0);
-              places.push([left, middle - line / 2, left + wide, middle + line / 2]);
-            }
-          }
-        }
-        const box = places.find(free);
-        if (!box) { text.remove(); continue; }
-        taken.push(box);
-        text.setAttribute("x", box[0] + 2);
-        text.setAttribute("y", box[3] - 4);
-        const near = box[0] > x ? box[0] : box[2], middle = (box[1] + box[3]) / 2;
-        if (Math.abs(middle - y) > line) add("path", { d: `M${x},${y}L${near},${middle}`, class: "leader" });
-      }
+
+    line(points, colour, width, dash = []) {
+      const style = `fill:none;stroke:var(--${colour});stroke-width:${width.toFixed(1)};stroke-linecap:round;`
+        + "stroke-linejoin:round" + (dash.length ? `;stroke-dasharray:${dash}` : "");
+      this.#draw("polyline", { points: this.#points(points) }, style);
     }
-    function change(what) {
-      if (what === "left") view.turn -= 0.15;
-      if (what === "right") view.turn += 0.15;
-      if (what === "up") view.tilt = Math.min(view.tilt + 0.1, Math.PI / 2);
-      if (what === "down") view.tilt = Math.max(view.tilt - 0.1, -0.3);
-      if (what === "larger") view.size = Math.min(view.size * 1.15, 6);
-      if (what === "smaller") view.size = Math.max(view.size / 1.15, 0.4);
-      render();
+
+    area(points, colour) {
+      this.#draw("polygon", { points: this.#points(points) }, `fill:var(--${colour});fill-opacity:0.3`);
     }
-    const keys = { ArrowLeft: "left", ArrowRight: "right", ArrowUp: "up", ArrowDown: "down",
-      "+": "larger", "=": "larger", "-": "smaller" };
-    container.addEventListener("keydown", (event) => {
-      if (!keys[event.key]) return;
-      event.preventDefault();
-      change(keys[event.key]);
-    });
-    let last = null;
-    container.addEventListener("pointerdown", (event) => {
-      last = [event.clientX, event.clientY];
-      container.setPointerCapture(event.pointerId);
-    });
-    container.addEventListener("pointermove", (event) => {
-      if (!last) return;
-      view.turn += (event.clientX - last[0]) * 0.008;
-      view.tilt = Math.min(Math.max(view.tilt + (event.clientY - last[1]) * 0.008, -0.3), Math.PI / 2);
-      last = [event.clientX, event.clientY];
-      render();
-    });
-    for (const end of ["pointerup", "pointercancel"]) container.addEventListener(end, () => { last = null; });
-    const figure = container.closest("figure");
+
+    dot([x, y], radius, fill, edge, width = 2) {
+      const stroke = edge ? `;stroke:var(--${edge});stroke-width:${width}` : "";
+      this.#draw("circle", { cx: x.toFixed(1), cy: y.toFixed(1), r: radius.toFixed(1) },
+        `fill:${fill ? `var(--${fill})` : "none"}${stroke}`);
+    }
+
+    words(text, x, y, colour) {
+      const escaped = text.replace(/[&<>"]/g, (sign) => `&#${sign.charCodeAt(0)};`);
+      this.#draw("text", { x: x.toFixed(1), y: y.toFixed(1) }, `font:${FONT};fill:var(--${colour});`
+        + "stroke:var(--page);stroke-width:4;paint-order:stroke;stroke-linejoin:round", escaped);
+    }
+
+    width(text) {
+      return this.measure.measureText(text).width;
+    }
+
+    end() {
+      this.svg.innerHTML = this.parts.join("");
+    }
+  }
+
+  function scene(container) {
+    const { marks, things, from, poses } = parsed("scenes")[container.dataset.scene];
+    const view = new View(container, new SvgPen(container)), figure = container.closest("figure");
     const slider = figure.querySelector("input"), output = figure.querySelector("output");
+    // Not every so many: the chains of a robot may take turns.
+    const others = poses.filter((_, i) => (0.618034 * i) % 1 < 24 / poses.length).map((pose) => pose.points);
     for (const button of figure.querySelectorAll("button[data-do]")) {
-      button.addEventListener("click", () => change(button.dataset.do));
+      button.addEventListener("click", () => view.move(button.dataset.do));
     }
     slider.max = poses.length;
     const choose = () => {
-      view.pose = Number(slider.value) - 1;
-      const pose = poses[view.pose];
-      const distance = pose.distance === null
-        ? "the only pose of its socket" : `${pose.distance.toPrecision(3)} mm from its ${from}`;
-      output.textContent = `${pose.label}: ${distance}`;
-      render();
+      const pose = poses[Number(slider.value) - 1];
+      const distance = pose.distance === undefined ? "" : pose.distance === null ? ": the only pose of its socket"
+        : `: ${pose.distance.toPrecision(3)} mm from its ${from}`;
+      output.textContent = pose.label + distance;
+      const carried = pose.carried.length ? [{ kind: "sight", points: pose.carried }] : [];
+      view.show({ links: pose.points, things: [...things, ...carried] });
     };
+    view.scene.others = others;
+    view.scene.places = marks.map(({ name, at }) => ({ name, position: at }));
+    view.scene.poses = poses.map((pose) => ({ tip: pose.points.at(-1), residual: pose.residual, shade: pose.shade }));
     slider.addEventListener("input", choose);
     choose();
-    new ResizeObserver(render).observe(container);
-    for (const when of ["beforeprint", "afterprint"]) window.addEventListener(when, render);
+    const enlarged = figure.querySelector("[data-enlarged]");
+    if (enlarged) enlarged.textContent = view.enlarged;
+    container.dataset.drawn = "yes";
+    for (const when of ["beforeprint", "afterprint"]) window.addEventListener(when, () => view.draw());
   }
 
   for (const container of document.querySelectorAll("[data-scene]")) scene(container);

@@ -10,7 +10,16 @@ from ..plot.parameters import models_chart
 from ..plot.study import metric_plots
 from ..study.results import study_summary
 from ..study.store import Results
-from ..study.tables import cell_table, factor_title, label, level_text, metric_table, metric_title, parameter_table
+from ..study.tables import (
+    cell_table,
+    factor_title,
+    label,
+    level_text,
+    metric_table,
+    metric_title,
+    parameter_table,
+    shown_unit,
+)
 from ..summaries.compared_models import MODELS_MEANING, model_tables
 from ..summaries.tables import format_number, number
 from .elements import Report, Section
@@ -40,7 +49,12 @@ def study_report(results: Results) -> Report:
         f"{factor_title(name)}: {', '.join(map(level_text, levels))}" for name, levels in summary["factors"].items()
     )
     parameters, sections = parameter_table(summary)._replace(folded=True), []
-    for name in (name for name in _SHOWN if any(name in cell["figures"] for cell in cells)):
+    metrics = [name for name in _SHOWN if any(name in cell["figures"] for cell in cells)]
+    picture = None
+    if metrics:
+        plots = metric_plots(results, metrics[0], together=True)
+        picture = Chart("first", f"Study: {metric_title(metrics[0])}", _PERCENTILES, plots[:1])
+    for name in metrics:
         title = metric_title(name) if name == "k" else metric_title(name)[0].upper() + metric_title(name)[1:]
         table, plots = metric_table(summary, name, title), metric_plots(results, name)
         sections.append(Section(f"figure-{name}", title, [Chart(f"chart-{name}", title, _PERCENTILES, plots, table)]))
@@ -52,8 +66,12 @@ def study_report(results: Results) -> Report:
         verdict=summary["finding"] or f"No trial has converged ({ran:,} trials run).",
         verdict_mark="bad" if ran and not converged else mark,
         warnings=warnings,
+        numbers=[
+            ("Trials run", f"{ran:,}", f"{100 * fraction:.4g} % converged"),
+            *(_spread(cells, name) for name in metrics[:2]),
+        ],
+        picture=picture,
         facts=[
-            ("Trials run", f"{ran:,} ({100 * fraction:.4g} % converged)"),
             ("Factors", "; ".join(factors) or "none varied"),
             ("Seed", str(summary["seed"])),
         ],
@@ -63,6 +81,16 @@ def study_report(results: Results) -> Report:
             *([Section("parameters", "Parameters", [parameters])] if parameters.rows else []),
         ],
     )
+
+
+def _spread(cells: list[dict[str, Any]], name: str) -> tuple[str, str, str]:
+    """The medians of a metric over the cells."""
+    unit, factor = shown_unit(name)
+    known = [factor * cell["figures"][name]["p50"]["value"] for cell in cells if name in cell["figures"]]
+    ends = dict.fromkeys(f"{end:.3g}" for end in (min(known), max(known)))
+    note = "median of the converged trials" + (" of a cell" if len(known) > 1 else "")
+    title = metric_title(name).partition(" [")[0]
+    return title[:1].upper() + title[1:], f"{' to '.join(ends)} {unit}".strip(), note
 
 
 def _warnings(summary: dict[str, Any]) -> list[str]:
@@ -111,13 +139,19 @@ def models_report(summary: dict[str, Any]) -> Report:
         verdict=" ".join(summary["findings"]),
         verdict_mark="unsure" if doubtful else "good",
         warnings=list(summary["warnings"]),
-        facts=[
-            ("Recommended model", chosen["model"]),
-            ("RMS error of this model in held-out regions", f"{format_number(chosen['rms_outside'])}\u00a0mm"),
-            ("Mean of (error / predicted standard deviation)² in held-out regions", number(chosen["ratio"], 2).text),
+        numbers=[
+            ("Recommended model", chosen["model"], ""),
+            ("Its RMS error in held-out regions", f"{format_number(chosen['rms_outside'])}\u00a0mm", ""),
+            (
+                "Its (error / predicted standard deviation)²",
+                number(chosen["ratio"], 2).text,
+                "mean in held-out regions",
+            ),
         ],
+        picture=models_chart(summary),
+        facts=[],
         sections=[
-            Section("models", "Errors inside and outside", [_MODELS, models_chart(summary), by_name, MODELS_MEANING]),
+            Section("models", "Errors inside and outside", [_MODELS, by_name, MODELS_MEANING]),
             Section("regions", title, [Chart("regions", title, says, tuple(plots), by_region)]),
         ],
     )

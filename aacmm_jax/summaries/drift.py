@@ -6,9 +6,10 @@ import numpy as np
 
 from ..core.text import csv_text
 from ..core.units import people_read, people_read_change
+from ..drift.due import next_due
 from ..drift.results import Drift, Trend
 from ..drift.statistics import LengthChange
-from ..uncertainty.coverage import in_percent
+from ..uncertainty.coverage import COVERAGE_FACTOR, in_percent
 from . import tables
 from .result_tables import listed_apart
 from .tables import Cell, Styled, View, attributes, decimals_for, listed, number, plain, rows_of
@@ -40,8 +41,9 @@ def drift_summary(drift: Drift) -> dict[str, Any]:
     }
 
 
-def compared_summary(trend: Trend, labels: list[str], arm: str) -> dict[str, Any]:
-    """The first calibration against the last in full, and the trend of all; ``labels`` in the order given."""
+def compared_summary(trend: Trend, labels: list[str], arm: str, limit: float | None = None) -> dict[str, Any]:
+    """The first calibration against the last in full, and the trend of all; ``labels`` in the order given. ``limit`` is
+    the change of a length at which the next calibration is due, mm; by default what the uncertainties alone show."""
     first, created = labels[trend.order[0]], trend.dates[0].isoformat()
     summary = {"kind": "comparison", "arm": arm, "old": first, "new": labels[trend.order[-1]]}
     summary |= {"old_created": created, "new_created": trend.dates[-1].isoformat()}
@@ -56,7 +58,29 @@ def compared_summary(trend: Trend, labels: list[str], arm: str) -> dict[str, Any
             "lengths": _lengths(drift.lengths),
             "parameters": _rows(drift),
         })  # fmt: skip
-    return summary | drift_summary(trend.drifts[-1]) | {"warnings": trend.warnings, "trend": rows}
+    due = _due(trend, limit)
+    return summary | drift_summary(trend.drifts[-1]) | {"warnings": trend.warnings, "trend": rows, "due": due}
+
+
+def _due(trend: Trend, limit: float | None) -> dict[str, Any] | None:
+    """By when the arm is to be calibrated again; None where its calibrations do not show it."""
+    last, probe = trend.drifts[-1].lengths, trend.drifts[-1].joint_test.probe
+    if probe is not None and probe.remounted:
+        return None  # which is no drift
+    stated = limit if limit is not None else COVERAGE_FACTOR * last.rms_by_chance
+    due = next_due(trend.dates, [drift.lengths.rms for drift in trend.drifts], stated)
+    if due is None:
+        return None
+    what = f"{due.limit:.2g} mm ({'the limit' if limit is not None else 'U of the change'})"
+    says = f"Next calibration due by {due.date:%Y-%m-%d}: at the rate seen until now ({due.rate:.2g} mm a year, RMS), "
+    if due.capped:
+        says += (
+            f"lengths of {last.length:g} mm will have changed by less than {what} then, but the arm has not been "
+            "observed over a longer time."
+        )
+    else:
+        says += f"lengths of {last.length:g} mm will have changed by {what} then."
+    return {"date": due.date.isoformat(), "rate_mm_per_year": due.rate, "limit_mm": due.limit, "says": says}
 
 
 def change_exceeded(lengths: LengthChange, limit: float | None) -> tuple[list[str], list[str]]:
@@ -115,6 +139,7 @@ def comparison(summary: dict[str, Any]) -> View:
     yield f"{summary['arm']}: {new} compared with {old}"
     yield from tables.warnings_of(summary)
     yield from summary["findings"]
+    yield from [summary["due"]["says"]] if summary.get("due") else []
     yield from comparison_tables(summary)
     yield from tables.limits_of(summary)
     yield from tables.written_of(summary)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..acceptance.procedure import Procedure
-from ..acceptance.standards import PLANNED
+from ..acceptance.standards import STANDARDS
 from ..core.text import pluralise
 from ..data.noise import linear_encoder_mm
 from ..kinematics.robots import chains_taken
@@ -115,7 +115,7 @@ def procedure_summary(procedure: Procedure, arm: str) -> dict[str, Any]:
     return {
         "kind": "acceptance plan",
         "arm": arm,
-        "standard": PLANNED[procedure.standard],
+        "standard": STANDARDS[procedure.standard],
         **attributes(procedure, "poses", measuring_range_mm="measuring_range", measuring_range_stated="range_stated"),
         **attributes(procedure.reach, reach_mm="radius", shoulder_mm="shoulder"),
         "bars": [{"length_mm": value, "positions": count} for value, count in lengths.items()],
@@ -211,10 +211,11 @@ def _predictions(summary: dict[str, Any], where: str, without: dict[str, Any] | 
         ("", "") if slide is None else (f", {slide:.3g} mm (linear encoders)", f"--linear-encoder-mm {slide:.3g} ")
     )
     model = "" if summary.get("model") is None else f"--model {summary['model']} "
+    source = f"; {summary['noise_source']}" if "noise_source" in summary else ""
     options = f" (--method joint {model}--encoder-arcsec {arcsec} {option}--seating-mm {seat:g})"
     yield (
         f"Assumed: one least-squares fit of all data{'' if by_joint else options}; noise of {arcsec} arcsec "
-        f"(encoders){linear} and {seat:g} mm (seating; {summary['noise_source']})."
+        f"(encoders){linear} and {seat:g} mm (seating{source})."
     )
     collisions, retract, tilt = summary["collisions"], summary["retract_mm"], summary["largest_tilt_deg"]
     by_way = f" via approach points {retract:g} mm above the sockets" if retract else ""
@@ -230,7 +231,7 @@ def _predictions(summary: dict[str, Any], where: str, without: dict[str, Any] | 
         )
     else:
         yield from _collisions(collisions)
-        yield from (f"Note: {note}" for note in summary["notes"])
+        yield from (f"Note: {note}" for note in summary.get("notes", ()))
 
 
 def _collisions(collisions: dict[str, Any]) -> View:

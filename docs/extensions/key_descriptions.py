@@ -47,6 +47,8 @@ DESCRIPTIONS = {
     "link": "The link that touches: the number of the joint before it, or in a URDF its name. By default the last one.",
     "base": "For a URDF: the link that does not move.",
     "acceptance": "Standards for whose acceptance procedure the poses were recorded.",
+    "measurements": "One table in place of the files: each row says of which file it is (column file, or artefact, "
+    "position, end).",
     "angles": "How readings are written.",
     "points": "Certified coordinates of the points by name, mm; in a manifest of points: how the files are written.",
     "socket": "A socket with its files.",

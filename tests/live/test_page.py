@@ -32,8 +32,10 @@ def shown(browser):
     """Open the page of a session; what the console says of errors is kept on it."""
     contexts = []
 
-    def show(address: str, width: int = 1600, scheme: str = "light", ready: bool = True):
-        context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    def show(address: str, width: int = 1600, scheme: str = "light", ready: bool = True, bypass_csp: bool = False):
+        context = browser.new_context(
+            viewport={"width": width, "height": 900}, color_scheme=scheme, bypass_csp=bypass_csp
+        )
         context.set_default_timeout(60_000)  # ms; a busy machine takes longer than Playwright's 30 s
         contexts.append(context)
         page = context.new_page()
@@ -135,6 +137,21 @@ def test_the_arm_moves_and_the_page_is_no_wider_than_the_screen(shown, width, sc
         size = page.evaluate("parseFloat(getComputedStyle(document.getElementById('headline')).fontSize)")
         assert size > (32 if width == 400 else 70)
         assert page.said == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("width", "scheme"), [(400, "dark"), (1000, "light"), (1600, "dark")])
+def test_everybody_can_read_it(shown, width, scheme):
+    """Axe finds nothing serious, also with a pose left out and a question asked; its script is its own."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    with serving(StubSession(poses=12, places=9)) as address:
+        page = shown(address, width, scheme, bypass_csp=True)
+        for key, there in (("", "#poses tr"), ("x", "#poses tr.excluded"), ("s", "dialog[open]")):
+            if key:
+                page.keyboard.press(key)
+            page.wait_for_selector(there)
+            found = [rule for rule in axe.run(page).response["violations"] if rule["impact"] in ("serious", "critical")]
+            assert [(rule["id"], rule["nodes"][0]["html"]) for rule in found] == []
 
 
 def test_a_click_opens_the_report_in_a_tab_without_an_origin(shown, tmp_path):

@@ -83,6 +83,7 @@ def main(source: str, target: str) -> None:
     robot = pin.RobotWrapper.BuildFromURDF(str(folder / "arm.urdf"))
     begin = time.process_time()
     calibrator = Points(robot, str(folder / "arm.yaml"))
+    calibrator.calib_config |= {"known_baseframe": False, "known_tipframe": False}
     calibrator.initialize()
     calibrator.solve(enable_logging=False)
     seconds = time.process_time() - begin
