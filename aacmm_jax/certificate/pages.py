@@ -194,6 +194,10 @@ def _with_u(quantity: Element, words: Language) -> str:
     """A value with its unit and standard uncertainty, as they were given."""
     unit = quantity.findtext("si:real/si:unit", "", PREFIXES)
     unit = _UNITS.get(unit, unit)
+    name = _content(quantity, "dcc:name")
+    if name.startswith("standard uncertainty"):  # of what an instrument measured
+        unit = "px" if name.endswith("in pixels") else unit
+        return f"u = {words.number(f'{float(_value(quantity)):.2g}')}\u00a0{unit}"
     u = quantity.findtext(f"{_UNCERTAINTY}si:standardMU/si:valueStandardMU", None, PREFIXES)
     number = f"{words.number(_value(quantity))}\u00a0{unit}".strip()
     return number if u is None else f"{number} (u = {words.number(_short(u))}\u00a0{unit})".replace("\u00a0)", ")")
