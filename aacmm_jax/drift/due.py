@@ -10,7 +10,14 @@ _LEAST = datetime.timedelta(days=1)  # between the first and the last calibratio
 
 
 class Due(NamedTuple):
-    """When lengths will have changed by a limit since the last calibration, at the rate seen until now."""
+    """When lengths will have changed by a limit since the last calibration, at the rate seen until now.
+
+    Example:
+        >>> import datetime
+        >>> due = aj.drift.next_due([datetime.datetime(2025 + i, 3, 1) for i in range(2)], [0.010], limit=0.1)
+        >>> print(f"{due.date:%Y-%m-%d}", due.capped)
+        2027-03-01 True
+    """
 
     date: datetime.datetime
     rate: float  # root mean square change of lengths, mm a year

@@ -122,7 +122,8 @@ def write_plan(
         sources: Names and digests of the files that the plan was made from.
 
     Example:
-        >>> plan = aj.planning.plan(arm, sockets={"A": (400, 200, 300)}, poses=12, noise=noise, candidates=200)
+        >>> sockets = {"A": (400, 200, 300), "B": (700, 500, 500)}
+        >>> plan = aj.planning.plan(arm, sockets=sockets, lengths=[("A", "B", 0.002)], poses=12, candidates=200)
         >>> written = aj.report.write_plan("plan.html", plan, "my arm")
         >>> print(written["title"])
         Plan of a calibration, my arm
