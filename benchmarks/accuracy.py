@@ -91,6 +91,7 @@ def hand_eye() -> dict[str, Row]:
     """Poses of a target on a UR10 with the maker's parameters."""
     recording = aj.files.read_manifest(ROOT / "examples/ipa_ur10/transforms.toml")
     (part,) = recording.capture.observations
+    assert isinstance(part, aj.data.observations.MeasuredTransforms)
     out = held_out_poses(recording.capture, None, 500, 0)[part.name]
     seen = np.tile(np.eye(4), (len(out), 1, 1))
     seen[:, :3, :3], seen[:, :3, 3] = np.asarray(part.rotations), np.asarray(part.points)
