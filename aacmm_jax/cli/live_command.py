@@ -72,13 +72,13 @@ def live(
         else:
             _serve(session, port, token, not no_browser)
             written = session.state()["paths"]
-        poses = session.state()["poses"]
+        state = session.state()
+    poses, used = len(state["poses"]), len(state["written"])
     if written:
-        used = sum(not (pose["outlier"] or pose["excluded"]) for pose in poses)
-        left = f" ({len(poses) - used} left out)" if used < len(poses) else ""
-        typer.echo(f"{pluralise(used, 'pose')}{left}; written: {', '.join(written)}")
+        left = f" ({poses - used} in {output}.journal only)" if used < poses else ""
+        typer.echo("\n".join([f"{pluralise(used, 'pose')}{left}; written: {', '.join(written)}", *state["says"]]))
     else:
-        typer.echo(f"{poses} poses are kept in {output}.journal; run the same command to go on.")
+        typer.echo(f"{pluralise(poses, 'pose')} are kept in {output}.journal; run the same command to go on.")
 
 
 def _serve(session: Any, port: int, others: bool, browser: bool) -> None:

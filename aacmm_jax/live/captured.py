@@ -27,7 +27,7 @@ class Captured:
         self.number = 0  # of the last pose, also where that was undone
         self.session, self.marks = 1, [""]  # number of the present session, and what was said of each
         self.temperature: float | None = None  # C, as it was typed in
-        self.paths: list[str] = []  # of files that were written
+        self.finished: dict[str, Any] = {}  # files that were written last, the poses in them, and what they say
 
     def apply(self, event: Mapping[str, Any]) -> None:
         """Let an event of the journal take effect."""
@@ -49,7 +49,7 @@ class Captured:
         elif kind == "temperature":
             self.temperature = event["celsius"]
         elif kind == "finished":
-            self.paths = list(event["paths"])
+            self.finished = {name: list(event.get(name, ())) for name in ("paths", "poses", "says")}
 
     def resume(self, journal: Journal) -> None:
         """Continue a journal of the same arm and places, or begin one. `InputError` where it is of another capture."""

@@ -14,7 +14,8 @@ from .candidates import TEN, Search
 
 _ENDLESS = 1e6  # times the information of the poses so far: as many poses in these places as anybody likes
 _CLOSE = 0.8  # part of U that is left with any number of poses, from which more poses hardly help
-_UNKNOWN = 3.0  # mm: a length known no better follows from the prior alone
+# A length that is known no better than this, mm, and than this part of what the prior alone says, is not determined.
+_UNKNOWN, _OF_PRIOR = 3.0, 0.3
 _MANY = 100  # poses, above which no number is predicted
 _SHARE = 0.3  # part of the variance that is named
 
@@ -48,13 +49,14 @@ def progress(
     """
     u = scale * search.u(known.base)
     floor = scale * search.u(known.base + _ENDLESS * taken)
-    met, determined = search.scaled and target is not None and u <= target, u < _UNKNOWN * scale
+    least_known = scale * max(_UNKNOWN, _OF_PRIOR * search.u(known.base - taken))
+    met, determined = search.scaled and target is not None and u <= target, u < least_known
     aim = target / scale if target is not None and determined and floor < target and not met else None
     planned = search.ahead(known, ahead, least, aim, lacking)
     after = scale * search.u(search.ten(known, planned))
     if not determined:
         limits = f"These poses do not determine lengths yet; {_least_known(search, known)}"
-        return Progress(None, after if after < _UNKNOWN * scale else None, limits, False, planned)
+        return Progress(None, after if after < least_known else None, limits, False, planned)
     length = f"U of {search.problem.check_length:.0f} mm"
     if not search.scaled:
         limits = (

@@ -183,24 +183,30 @@ class Session:
 
     def finish(self, calibrate: bool = True) -> list[str]:
         """Write the capture, and the calibration with its report; the names of the files. The session goes on. Poses
-        that guidance leaves out, since they do not fit, are in the journal only."""
+        that guidance leaves out, since they do not fit, are in the journal only, as are those that follow by hand: no
+        pose is taken by itself any more."""
         with self._lock:
             self._busy = "Calibrating" if calibrate else "Writing"
             self._version += 1
         try:
-            paths = written(self.setup, fitting(self._poses_seen, self._stop), self.path, calibrate)
+            poses = fitting(self._poses_seen, self._stop)
+            true = next((arm for device in self._devices if (arm := device.truth()) is not None), None)
+            paths, says = written(self.setup, poses, self.path, calibrate, true)
         finally:
             with self._lock:
                 self._busy = None
                 self._version += 1
         with self._lock:
-            self._record({"event": "finished", "paths": paths})
+            self._auto = False
+            used = [pose.number for pose in poses if not pose.excluded]
+            self._record({"event": "finished", "paths": paths, "says": says, "poses": used})
         return paths
 
     def report(self) -> Path | None:
         """The report that was written last."""
         with self._lock:
-            found = Path(self._captured.paths[-1]) if self._captured.paths else None
+            paths = self._captured.finished.get("paths")
+            found = Path(paths[-1]) if paths else None
         return found if found is not None and found.suffix == ".html" and found.is_file() else None
 
     def close(self) -> None:
@@ -247,7 +253,10 @@ class Session:
                 return live
             if self._shown[0] != self._version:
                 state = state_of(self.setup, self._captured, self._where, self._next, self.target)
-                unread = [device.name for device in self._devices if not device.connected]
+                unread = [f"Not connected: {device.name}" for device in self._devices if not device.connected]
+                if self._readings.q is None:  # whatever comes, nothing is readings
+                    bad = [(device.name, device.bad.most_common(1)[0][0]) for device in self._devices if device.bad]
+                    unread += [f"{name}: no line can be used yet ({reason})" for name, reason in bad]
                 busy = self._busy or ("Planning the first poses" if self._planning and not unread else None)
                 state |= {"headline": headline(busy, unread, state), "auto": self._auto}
                 self._shown = self._version, state | {"busy": self._busy, "message": self._message}
@@ -328,6 +337,8 @@ class Session:
             if not samples and not raw:
                 continue
             with self._lock:
+                if self._readings.q is None:
+                    self._changed()  # from no line to lines, or to the first readings
                 try:
                     if self._stream is not None:
                         self._stream.write(raw or lines_of(samples))

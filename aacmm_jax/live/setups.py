@@ -8,18 +8,22 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError, naming
+from ..core.numpy_or_jax import to_numpy
 from ..core.rotations import fitted_frame
 from ..core.units import DEG
 from ..data.observations.held import SimulatedArtefact, SimulatedSocket
 from ..data.observations.measured import SimulatedDistances, SimulatedPoints
 from ..data.observations.simulated import AbstractSimulated
-from ..files.arms import load_noise, load_specification
+from ..data.simulation import simulate
+from ..files.arms import for_capture, load_noise, load_specification
 from ..files.inputs import InputFile
 from ..files.kits import kit_lengths, kit_targets, read_kit
 from ..files.manifest_tables import PosesManifest
 from ..files.text_table import TextTable
 from ..files.toml import read_toml
 from ..kinematics.arm import Arm, by_joint
+from ..kinematics.parameters import ArmSpecification
+from ..planning.kit_placement import KitItem
 from .places import Setup, setup_of
 
 _OTHERS = "give the kit itself with --kit"
@@ -59,6 +63,7 @@ def read_setup(
     noise = load_noise(arm, base=base, tip=tip)
     if kit is not None:
         things = read_kit(kit, lengths=True)
+        specification = _for_kit(specification, things)
         return setup_of(specification, noise, things, kit_lengths(kit))._replace(targets=kit_targets(kit))
     path = Path(str(plan))
     model: Any = read_toml(path, PosesManifest)
@@ -70,6 +75,18 @@ def read_setup(
         for place, *_ in planned:
             setup.place(place)
     return setup
+
+
+def _for_kit(specification: ArmSpecification, kit: Sequence[KitItem]) -> ArmSpecification:
+    """The arm with the parameters that a kit of targets alone determines, as a simulated capture of it shows."""
+    things = [item.simulated for item in kit]
+    if any(isinstance(thing, SimulatedSocket | SimulatedArtefact) for thing in things):
+        return specification
+    try:
+        capture = simulate(to_numpy(specification.arm), sockets={}, observations=things, seed=0)
+    except InputError:  # where they are not within reach, guidance says so
+        return specification
+    return for_capture(specification, True, capture)
 
 
 def _tables(model: Any) -> list[tuple[str, Any]]:

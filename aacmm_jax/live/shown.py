@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.numpy_or_jax import to_numpy
-from ..core.text import printable
+from ..core.text import pluralise, printable
 from ..kinematics.arm import Arm, by_joint, joint_limits
 from ..kinematics.chain import forward_pass, joint_motion
 from . import guidance as guiding
@@ -87,7 +87,9 @@ def state_of(
         },
         "sentences": list(guidance.sentences) if guidance else [],
         "stop": bool(guidance and guidance.stop),
-        "paths": list(captured.paths),
+        "paths": captured.finished.get("paths", []),
+        "says": captured.finished.get("says", []),
+        "written": captured.finished.get("poses", []),
         "session": captured.session,
         "temperature": captured.temperature,
     }
@@ -120,14 +122,20 @@ def headline(busy: str | None, unread: Sequence[str], state: dict[str, Any]) -> 
     if busy:
         return f"{busy} ..."
     if unread:
-        return f"Not connected: {shown_text(unread[0])}"
+        return shown_text(unread[0])
     last = state["poses"][-1] if state["poses"] else None
     if last and last["outlier"] and not last["excluded"]:
         return f"Pose {last['number']} does not fit: take it again in {last['place']}"
+    if state["paths"]:
+        number = len(state["written"])
+        more = sum(pose["number"] > max(state["written"], default=0) for pose in state["poses"])
+        return f"Finished with {pluralise(number, 'pose')}" + (f"; {more} since then are in no file" if more else "")
     if state["stop"]:
         return "The target is met: finish, or take more poses"
     if not state["next"]:
         return "Take a pose"
+    if state["progress"]["u_target_mm"] is None and all(p["poses"] >= p["wanted"] for p in state["places"]):
+        return "Every place has its poses: finish, or take more"
     place = next(place for place in state["places"] if place["name"] == state["next"]["place"])
     alone = len(state["places"]) == 1
     goal = place["name"] if place["position"] else f"the next pose{'' if alone else ' for ' + place['name']}"

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ..data.recording import Recording
 from ..files.captures import save_capture
+from ..kinematics.arm import Arm
 from .guidance import Guidance
 from .places import Setup, TakenPose, capture_of
 
@@ -27,20 +28,31 @@ def fitting(look: Callable[[], tuple[Sequence[TakenPose], Guidance | None]], sto
     return [pose for pose in poses if pose.number not in wrong]
 
 
-def written(setup: Setup, poses: Sequence[TakenPose], path: Path, calibrate: bool) -> list[str]:
-    """Write a capture, and if asked for its calibration and report beside it; the names of the files."""
+def written(
+    setup: Setup, poses: Sequence[TakenPose], path: Path, calibrate: bool, true: Arm | None = None
+) -> tuple[list[str], list[str]]:
+    """Write a capture, and if asked for its calibration and report beside it; the names of the files, and what the
+    calibration says: its verdict, and its warnings. ``true``: the arm of a simulation."""
+    from ..calibration.record import uncertainty_of
     from ..files.calibrations import save_calibration
     from ..pipeline.capture_calibration import calibrate_capture
     from ..report import write_report
+    from ..summaries.calibration import calibration_summary
+    from ..uncertainty.volume import volumetric_uncertainty
 
     capture, _ = capture_of(setup, poses)
-    recording = Recording(capture, setup.specification, usual=setup.noise, measured=time.strftime("%Y-%m-%d"))
+    simulated = None if true is None else setup.specification._replace(arm=true)
+    recording = Recording(
+        capture, setup.specification, simulated, usual=setup.noise, measured=time.strftime("%Y-%m-%d")
+    )
     save_capture(path, recording)
     if not calibrate:
-        return [str(path)]
+        return [str(path)], []
     scaled = capture.lengths or any(observation.fixes_scale for observation in capture.observations)
     calibration = path.with_name(f"{path.stem}-calibration.h5")
-    save_calibration(calibration, calibrate_capture(recording, scale="measured" if scaled else "nominal"))
+    record = calibrate_capture(recording, scale="measured" if scaled else "nominal")
+    save_calibration(calibration, record)
     report = calibration.with_suffix(".html")
     write_report(calibration, report)
-    return [str(path), str(calibration), str(report)]
+    summary = calibration_summary(record, volumetric_uncertainty(uncertainty_of(record)))
+    return [str(path), str(calibration), str(report)], [summary["verdict"]["says"], *summary["warnings"]]

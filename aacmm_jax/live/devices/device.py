@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from ...core.errors import InputError, nearest
 from ...core.text import number
+from ...kinematics.arm import Arm
 from ..places import Place
 from ..samples import Sample
 
@@ -54,6 +55,10 @@ class AbstractDevice(abc.ABC):
         self, place: Place | None, q: Float[np.ndarray, " n"] | None, start: Float[np.ndarray, " n"] | None = None
     ) -> None:
         """Say which pose is wanted next, and where the motion to it begins; only what moves by itself heeds it."""
+
+    def truth(self) -> Arm | None:
+        """The arm itself, which only a simulation knows."""
+        return None
 
     def close(self) -> None:  # noqa: B027
         """Give up the connection."""

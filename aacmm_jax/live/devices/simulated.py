@@ -18,7 +18,7 @@ from ...core.numpy_or_jax import to_numpy
 from ...core.rotations import rotation_matrix
 from ...core.units import ARCSEC
 from ...data.observations.pixels import Pixels
-from ...kinematics.arm import joint_limits
+from ...kinematics.arm import Arm, joint_limits
 from ...kinematics.inverse_kinematics import project_to_targets
 from ...kinematics.parameters import perturbed_arm
 from ..places import COLUMNS, Place, Setup, by_thing
@@ -89,6 +89,9 @@ class Simulated(AbstractDevice):
         self._kept = np.eye(self.joints)  # motions that the seat allows
         # Set by another thread.
         self._goals: deque[tuple[Place | None, np.ndarray, np.ndarray | None]] = deque(maxlen=1)
+
+    def truth(self) -> Arm:
+        return self.true
 
     def _true_positions(self) -> dict[str, Float[np.ndarray, " 3"]]:
         """Things stand a little elsewhere than expected, each as a whole, and sockets as far apart as is certified."""

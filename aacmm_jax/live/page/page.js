@@ -4,7 +4,7 @@ import { View } from "./view.js";
 const $ = (id) => document.getElementById(id);
 const view = new View($("view"));
 const token = location.hash.slice(1);
-let state = null, here = null, chosen = null, sounds = null, loud = true, audio = null;
+let state = null, here = null, chosen = null, sounds = null, loud = true, audio = null, finished = true;
 
 const digits = (value, count = 3) => Number(value.toPrecision(count)).toString();
 const known = (value) => typeof value === "number";
@@ -242,11 +242,14 @@ function everything() {
   places();
   poses();
   $("skip").disabled = !next;
+  const said = { sentences: [...(state.says ?? []), ...(state.sentences ?? [])], paths: state.paths };
   for (const id of ["sentences", "paths"]) {
-    $(id).replaceChildren(...(state[id] ?? []).map((text) => element("li", text)));
+    $(id).replaceChildren(...(said[id] ?? []).map((text) => element("li", text)));
   }
   $("report").hidden = !state.paths?.at(-1)?.endsWith(".html");
-  $("results").hidden = !state.sentences?.length && !state.paths?.length;
+  $("results").hidden = !said.sentences.length && !state.paths?.length;
+  if (state.paths?.length && !finished) $("results").scrollIntoView({ block: "nearest" });
+  finished = Boolean(state.paths?.length);
   view.show({ places: state.places, poses: state.poses, next: next?.place ?? null,
     ghost: next?.links?.length ? { links: next.links } : null });
 }
