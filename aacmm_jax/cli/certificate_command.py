@@ -31,10 +31,11 @@ def certificate(
     ),
     force: bool = flag("--force", "Certify a calibration that is not usable all the same."),
 ) -> None:
-    """Write the certificate of a calibration, two pages as PDF or HTML.
+    """Write the certificate of a calibration on two pages.
 
-    It contains identification, conditions, traceability, results with U and k, acceptance tests and their decision
-    rule, and a place for the signature. export --format dcc writes the Digital Calibration Certificate alone.
+    It is a PDF or HTML, and contains identification, conditions, traceability, results with U and k, acceptance tests
+    and their decision rule, and a place for the signature. export --format dcc writes the Digital Calibration
+    Certificate alone.
     """
     from ..certificate.printed import certificate_html, certificate_pdf
 

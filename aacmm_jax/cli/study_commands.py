@@ -45,7 +45,7 @@ def study(
     ),
     as_json: bool = options.JSON,
 ) -> None:
-    """Run a Monte Carlo study of simulated calibrations.
+    """Run a Monte Carlo study of calibrations.
 
     Repeat the command to continue a study that was interrupted.
     """

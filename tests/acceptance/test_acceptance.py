@@ -673,7 +673,7 @@ def test_an_arm_that_cannot_take_a_zone_goes_without_it():
     assert "0 to 20 %" in procedure.left_out[0]
     assert {item.name for item in procedure.sockets if item.name.startswith("spat")} == {"spat/middle", "spat/far"}
     assert_refused(lambda: plan_procedure(aj.load_arm("iiwa14"), "asme", margin=3.0), "margin")
-    assert_refused(lambda: plan_procedure(aj.load_arm("iiwa14"), "vdi"), "choose one of asme, iso")
+    assert_refused(lambda: plan_procedure(aj.load_arm("iiwa14"), "vdi"), "choose one of jjf, asme, iso")
 
 
 def test_planned_poses_can_be_taken(cheng, procedure):

@@ -71,7 +71,8 @@ def test_an_acceptance_test_is_simulated(nominal):
         ),
         (SOCKETS, {"true": "panda"}, ("has 7 joints, but 'Cheng 2018, simulated arm' has 6",)),
         (SOCKETS, {"deviate_length": -1.0}, ("deviate_length is -1",)),
-        (SOCKETS, {"acceptance": "jjf"}, ("acceptance is 'jjf'",)),
+        (SOCKETS, {"acceptance": "jjf"}, ("leave out --socket",)),
+        (None, {"acceptance": "vdi"}, ("acceptance is 'vdi'",)),
     ],
 )
 def test_refused(nominal, sockets, options, parts):

@@ -144,7 +144,7 @@ def test_equally_good_parameters_are_told_apart_as_rarely_as_stated():
 def test_what_cannot_be_verified():
     nominal, real, delivered = arms(5, 1.0, 0.3)
     recorded = recording(nominal, real)
-    with pytest.raises(aj.InputError, match="--delivered, or as_found"):
+    with pytest.raises(aj.InputError, match="--delivered, or the nominal arm, or as_found"):
         aj.verify(recorded)
     with pytest.raises(aj.InputError, match="has 7 joints"):
         aj.verify(recorded, aj.load_arm("panda"))
