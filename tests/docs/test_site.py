@@ -70,10 +70,10 @@ def site(tmp_path_factory):
     left_out = "exclude_patterns=_build,notebooks/*,reference/api/*,reference/gallery*"
     command = [sys.executable, "-m", "sphinx", "-q", "-b", "html", "-D", left_out, str(DOCS), str(target)]
     subprocess.run(command, check=True, capture_output=True, timeout=600)
-    server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(target)))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield f"http://127.0.0.1:{server.server_address[1]}"
-    server.shutdown()
+    with ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(target))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+        server.shutdown()
 
 
 @pytest.fixture(scope="module")
