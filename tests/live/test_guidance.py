@@ -190,7 +190,9 @@ def test_poses_that_were_skipped_are_not_proposed_again() -> None:
 @pytest.mark.slow
 def test_what_nothing_measures_is_taken_as_exact() -> None:
     kit = Path(__file__).parents[2] / "examples" / "webcam" / "kit.toml"
-    search = Search(aj.live.read_setup("so100", kit=kit))
+    setup = aj.live.read_setup("so100", kit=kit)
+    assert {"d_5", "theta_5", "probe_x", "probe_y", "probe_z"} <= set(setup.specification.space().held)
+    search = Search(setup._replace(specification=aj.files.load_specification("so100")))
     columns = zip(search.problem.space.names, search.problem.lengths.T, strict=True)
     unseen = [name for name, column in columns if not column.any()]
     assert unseen
