@@ -50,6 +50,7 @@ class Captured:
             self.temperature = event["celsius"]
         elif kind == "finished":
             self.finished = {name: list(event.get(name, ())) for name in ("paths", "poses", "says")}
+            self.finished["until"] = event.get("until", 0)  # number of the last pose that there was
 
     def resume(self, journal: Journal) -> None:
         """Continue a journal of the same arm and places, or begin one. `InputError` where it is of another capture."""

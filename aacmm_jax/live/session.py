@@ -188,6 +188,7 @@ class Session:
         with self._lock:
             self._busy = "Calibrating" if calibrate else "Writing"
             self._version += 1
+            until = self._captured.number
         try:
             poses = fitting(self._poses_seen, self._stop)
             true = next((arm for device in self._devices if (arm := device.truth()) is not None), None)
@@ -199,7 +200,7 @@ class Session:
         with self._lock:
             self._auto = False
             used = [pose.number for pose in poses if not pose.excluded]
-            self._record({"event": "finished", "paths": paths, "says": says, "poses": used})
+            self._record({"event": "finished", "paths": paths, "says": says, "poses": used, "until": until})
         return paths
 
     def report(self) -> Path | None:

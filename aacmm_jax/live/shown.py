@@ -90,6 +90,7 @@ def state_of(
         "paths": captured.finished.get("paths", []),
         "says": captured.finished.get("says", []),
         "written": captured.finished.get("poses", []),
+        "written_until": captured.finished.get("until", 0),
         "session": captured.session,
         "temperature": captured.temperature,
     }
@@ -126,10 +127,8 @@ def headline(busy: str | None, unread: Sequence[str], state: dict[str, Any]) -> 
     last = state["poses"][-1] if state["poses"] else None
     if last and last["outlier"] and not last["excluded"]:
         return f"Pose {last['number']} does not fit: take it again in {last['place']}"
-    if state["paths"]:
-        number = len(state["written"])
-        more = sum(pose["number"] > max(state["written"], default=0) for pose in state["poses"])
-        return f"Finished with {pluralise(number, 'pose')}" + (f"; {more} since then are in no file" if more else "")
+    if state["paths"] and (last is None or last["number"] <= state["written_until"]):
+        return f"Finished with {pluralise(len(state['written']), 'pose')}"
     if state["stop"]:
         return "The target is met: finish, or take more poses"
     if not state["next"]:

@@ -145,3 +145,4 @@ def test_a_lock_that_cannot_be_removed_while_it_is_held_is_left(tmp_path, monkey
     for _ in range(2):
         with runner._locked(OutputFile(tmp_path / "study.h5")):
             pass
+        assert list(tmp_path.iterdir())
