@@ -162,11 +162,7 @@ def test_servos_on_a_bus_are_read_and_bad_answers_counted(tmp_path):
 
 # A camera
 
-
-def test_a_camera_finds_the_target_of_a_kit(tmp_path):
-    cv2 = pytest.importorskip("cv2")
-    kit = tmp_path / "kit.toml"
-    kit.write_text("""
+CAMERA = """
 [[camera]]
 name = "webcam"
 image_size = [640, 480]
@@ -181,10 +177,14 @@ marker = 22
 name = "eye"
 camera = "webcam"
 target = "board"
-mount = [60, 0, 20, 0, 0, 0]
-frame = [3.14159, 0, 0, 300, 0, 0]
-distance = [250, 400]
-""")
+distance = [250, 500]
+"""
+
+
+def test_a_camera_finds_the_target_of_a_kit(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    kit = tmp_path / "kit.toml"
+    kit.write_text(CAMERA + "mount = [60, 0, 20, 0, 0, 0]\nframe = [3.14159, 0, 0, 300, 0, 0]\n")
     setup = aj.live.read_setup("ur10e", kit=kit)
     board, facing = setup.targets["board"], np.eye(4)
     facing[:3, 3] = -105.0, -75.0, 400.0

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import aacmm_jax as aj
 
 from .line_sources import Pty, Server, checked_line, columns
-from .test_devices import Bus
+from .test_devices import CAMERA, Bus
 
 ARM = "cheng2018-simulation"
 POINTS = {"A": [400.0, 200.0, 300.0], "B": [450.0, -150.0, 250.0]}
@@ -293,27 +293,6 @@ def test_a_recording_that_is_played_back_gives_a_capture(tmp_path, kit, kind):
         np.testing.assert_allclose(seen.q, poses, atol=1e-5)
         tips = np.asarray(aj.load_arm(ARM).position(poses))
         np.testing.assert_allclose(seen.points, tips, atol=0.02)
-
-
-CAMERA = """
-[[camera]]
-name = "webcam"
-image_size = [640, 480]
-intrinsics = { fx = 600, fy = 600, cx = 319.5, cy = 239.5 }
-
-[[target]]
-name = "board"
-kind = "charuco"
-squares = [7, 5]
-size = 30
-marker = 22
-
-[[pixels]]
-name = "eye"
-camera = "webcam"
-target = "board"
-distance = [250, 500]
-"""
 
 
 @pytest.mark.slow
