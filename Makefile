@@ -97,7 +97,7 @@ test-lowest:
 	$(OPTIMISED) .venv-lowest/bin/python $(PYTEST) -W ignore::DeprecationWarning $(SELECTION)
 
 check: .venv/.dev
-	$(BIN)/ruff check . .ci/try_package .ci/readme_commands .ci/release
+	$(BIN)/ruff check --no-cache . .ci/try_package .ci/readme_commands .ci/release
 	$(BIN)/ruff format --check . .ci/try_package .ci/readme_commands .ci/release
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports --no-cache
