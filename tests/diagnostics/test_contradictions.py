@@ -196,7 +196,6 @@ def test_of_two_sockets_either_may_be_wrong(paper_arm):
     assert "--without 'B'" in said
 
 
-@pytest.mark.slow
 def test_without_noise(paper_arm):
     capture = aj.simulate(paper_arm, HOLES, poses=12, lengths=[aj.ReferenceLength("P/0", "P/1", 200.0)], seed=3)
     assert contradictions(calibrated(paper_arm, capture)) == []

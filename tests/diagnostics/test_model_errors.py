@@ -89,7 +89,7 @@ def test_nothing_wrong(paper_arm, captured, given):
     assert rows_of_tests(found)["missing_terms"] == []
 
 
-@pytest.mark.slow
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("given", [True, False])
 @pytest.mark.parametrize(
     ("errors", "expected", "amplitude", "cause"),

@@ -43,7 +43,7 @@ def calibrated(arm, capture, **options):
     return aj.calibrate(arm, capture, bounds, undetermined="ignore", **options)
 
 
-@pytest.mark.slow
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("method", "given", "joint", "tracker"),
     [
