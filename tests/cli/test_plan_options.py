@@ -68,6 +68,7 @@ def test_a_measuring_arm_points_along_its_probe(paper_arm, probe, axis):
     assert _probe_axis(paper_arm.replace(probe=np.array(probe, dtype=float))) == axis
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
@@ -89,6 +90,7 @@ def test_refused(aacmm, arguments, text):
     assert text in aacmm(*PLAN, *arguments, expect=2).stderr
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("options", "text"),
     [

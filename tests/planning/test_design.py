@@ -137,6 +137,7 @@ def test_poses_can_be_taken(paper_arm, given):
     assert float(length.value) == pytest.approx(np.linalg.norm(points[1] - points[0]))
 
 
+@pytest.mark.slow
 def test_predictions_are_those_of_calibrations(paper_arm, given):
     """The prediction is the uncertainty of a joint calibration on the planned capture."""
     bounds = aj.Bounds.around(paper_arm, aj.Parameters.free_of(paper_arm))
@@ -146,6 +147,7 @@ def test_predictions_are_those_of_calibrations(paper_arm, given):
     assert np.median(volume.u_length) == pytest.approx(given.predicted.median, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_plan_is_better_than_random_poses_and_ten_more_are_better_still(given):
     assert given.predicted.largest < 0.9 * given.random.largest
     assert given.predicted.median < given.random.median
@@ -153,6 +155,7 @@ def test_a_plan_is_better_than_random_poses_and_ten_more_are_better_still(given)
     assert given.loose.largest == pytest.approx(given.predicted.largest, rel=0.1)
 
 
+@pytest.mark.slow
 def test_placements_are_in_the_region_and_the_range(paper_arm, quick):
     region = {"z": (100.0, 900.0), "distance": (300.0, 1200.0)}
     reported = []
@@ -207,6 +210,7 @@ def test_by_default_what_is_placed_is_between_the_table_and_a_hand(options, z):
     assert PlanOptions(**options).ranges["z"] == z
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_plan(paper_arm, quick):
     """And keeps to the usual heights, at a cost that it states."""
     options = {"sockets": 2, "poses": 12, "candidates": 200, "seed": 3}
@@ -220,6 +224,7 @@ def test_the_same_seed_gives_the_same_plan(paper_arm, quick):
     assert "To see what" not in printed[1]
 
 
+@pytest.mark.slow
 def test_files(given, tmp_path):
     save_plan(tmp_path / "plan.csv", given)
     lines = (tmp_path / "plan.csv").read_text().splitlines()
@@ -234,6 +239,7 @@ def test_files(given, tmp_path):
     assert sum(row["poses"] for row in summary["sockets"]) == 20
 
 
+@pytest.mark.slow
 def test_readings_taken_by_the_plan_come_back_through_its_manifest(paper_arm, given, tmp_path):
     (tmp_path / "capture.toml").write_text(plan_manifest(given, "cheng2018-simulation"))
     for name, q in given.capture().sockets.items():
