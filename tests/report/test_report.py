@@ -356,7 +356,10 @@ def test_a_report_says_what_was_left_out(observed_record):
     (row,) = removed_tables(record)[0].cells
     expected = ["T2", "station", "T2/day, T2/night", "45.6", "6 and 60", "< 0.0001", "0.2000", "0.1000"]
     assert [cell.text for cell in row] == [*expected, "theta_3, by 12.0 u"]
-    assert removal(record.removed[0]).says.startswith("Left out: station T2")
+    assert "Left out: station T2, which contradicts the other data (F = 45.6 with 6 and" in removal(removed).says
+    clear = removed._replace(ratio=5.74e9)
+    assert removed_tables(record._replace(removed=(clear,)))[0].cells[0][3].text == "> 1000"
+    assert "(F > 1000 with 6 and 60 degrees of freedom" in removal(clear).says
 
 
 @pytest.mark.slow
@@ -885,6 +888,19 @@ def test_a_plan_has_a_page_for_the_machine(tmp_path, paper_arm):
     scene = json.loads(found.held["scenes"])["scene"]
     np.testing.assert_allclose([pose["points"][-1] for pose in scene["poses"]], paper_arm.position(plan.q), atol=0.06)
     assert [thing["kind"] for thing in scene["things"]] == ["bar"]
+
+
+@pytest.mark.parametrize("bars", [8, 9])
+def test_of_many_bars_the_view_shows_one_at_a_time(paper_arm, bars):
+    """It knows the bar by the names of its ends, and of each pose the end that it is at."""
+    sockets = {f"{bar}{end}": np.full((1, 6), 0.1 * bar + 0.01 * (end == "b")) for bar in range(bars) for end in "ab"}
+    lengths = [aj.ReferenceLength(f"{bar}a", f"{bar}b", 10.0, 0.002) for bar in range(bars)]
+    view = elements.view_of_arm(paper_arm, aj.Capture(sockets, lengths))
+    ends, marks = ([part.get(key) for part in view.data[of]] for key, of in (("ends", "things"), ("mark", "poses")))
+    many = bars > 8
+    assert ends == [[f"{bar}a", f"{bar}b"] if many else None for bar in range(bars)]
+    assert marks == (list(sockets) if many else [None] * 2 * bars)
+    assert ("its bar; thin lines" in view.legend[0]) == many
 
 
 @pytest.mark.parametrize(
