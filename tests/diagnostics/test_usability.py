@@ -58,7 +58,6 @@ def made(readings, changed, stated=None):
 
 
 @pytest.mark.first_rows(1)
-@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("changed", "stated", "severity", "reason"),
     [
