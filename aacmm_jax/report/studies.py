@@ -1,5 +1,6 @@
 """The reports of many calibrations: of a Monte Carlo study, and of compared models, inside and outside, by region."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from ..study.tables import (
     shown_unit,
 )
 from ..summaries.compared_models import MODELS_MEANING, model_tables
-from ..summaries.tables import format_number, number
+from ..summaries.tables import format_number
 from .elements import Report, Section
 
 _SHOWN = (
@@ -142,11 +143,7 @@ def models_report(summary: dict[str, Any]) -> Report:
         numbers=[
             ("Recommended model", chosen["model"], ""),
             ("Its RMS error in held-out regions", f"{format_number(chosen['rms_outside'])}\u00a0mm", ""),
-            (
-                "Its (error / predicted standard deviation)²",
-                number(chosen["ratio"], 2).text,
-                "mean in held-out regions",
-            ),
+            ("Its error / the predicted error", f"{math.sqrt(chosen['ratio']):.2f}", "RMS; 1 is expected"),
         ],
         picture=models_chart(summary),
         facts=[],

@@ -17,8 +17,8 @@ from aacmm_jax.data.recording import ReadImage
 from aacmm_jax.diagnostics.joint_travel import tried_poses
 from aacmm_jax.plot import charts, svg
 from aacmm_jax.plot.lengths import tried_shades
-from aacmm_jax.report import elements, write_report
-from aacmm_jax.report.html_page import _origin
+from aacmm_jax.report import elements, plans, write_report
+from aacmm_jax.report.html_page import _identity, _origin
 from aacmm_jax.summaries.tables import Table, decimals_for, format_number, number
 from tests.refusals import assert_refused
 from tests.written_study import write_study
@@ -367,7 +367,7 @@ def test_groups_held_out_are_listed_one_by_one_the_worst_first(written):
     rows = tables["Groups held out [mm]"].rows
     assert rows[0][0].text.startswith("high")
     assert [cell.value for cell in rows[0][1:5]] == pytest.approx([10, 1.17, 0.31, 0.025 * math.sqrt(2)])
-    assert [row[-1].text for row in rows] == ["disagrees", "", ""]
+    assert [row[1].text for row in rows] == ["disagrees", "", ""]
     (unknown,) = (row for row in rows if row[0].text.startswith("open"))
     assert unknown[3].text == "–"
 
@@ -600,6 +600,18 @@ def test_marks_stand_where_their_numbers_say():
     assert 'd="M250 500h0M750 0h0"' in drawn
     assert svg.points(plot) == [[250, 500, "a"], [750, 0, "c"]]
     assert '<text x="50.00%" y="100%"' in drawn
+
+
+def test_long_names_of_an_axis_have_room():
+    """Slanted to the left of their ticks, without their middle, however long they are."""
+    names = [f"measuring_station_{i}/nest" for i in range(3)]
+    plot = charts.Plot(charts.names("", names), charts.linear("y", [0, 1]), ())
+    drawn = svg.drawn(plot, "caption")
+    assert [words in drawn for words in ("measuring_s…ion_0/nest", *names)] == [True, False, False, False]
+    below, left = map(float, re.search("padding:6px 12px (.*)px (.*)px", drawn).groups())
+    assert below < 150  # pixels
+    across = 0.5 * 6.6 * len("measuring_s…ion_0/nest")  # pixels, of the first name
+    assert left + 280 * plot.x.at(0.0) > across  # on a telephone
 
 
 def test_lengths_stand_placement_by_placement():
@@ -876,9 +888,42 @@ def test_a_plan_has_a_page_for_the_machine(tmp_path, paper_arm):
     assert [thing["kind"] for thing in scene["things"]] == ["bar"]
 
 
+def test_the_page_of_an_acceptance_test_has_no_files_that_are_called_as_their_ends():
+    headings, row = "pose,test,name,file,x_mm,probe_direction_x", "1,length error,bar1/a,{},1.5,0.1"
+    for file, expected in (("bar1/a.csv", []), ("a.csv", ["file"])):
+        table = plans._table(f"{headings}\n{row.format(file)}")
+        assert table.headings == ["done", "pose", "test", "name", *expected, "x [mm]"]
+
+
+def test_a_bar_is_named_once(paper_arm):
+    q = {name: Q[i : i + 2] for i, name in enumerate(("bar1/a", "bar1/b", "C", "on/a", "on/b", "on/c"))}
+    lengths = [aj.ReferenceLength(*ends, 100.0, 0.01) for ends in (("bar1/a", "bar1/b"), ("on/a", "on/b"))]
+    data = elements.view_of_arm(paper_arm, aj.Capture(q, lengths)).data
+    assert [mark["name"] for mark in data["marks"]] == ["", "", "C", "on/a", "on/b", "on/c"]
+    assert [thing.get("name") for thing in data["things"]] == ["bar1", None]
+
+
+@pytest.mark.parametrize(
+    ("measured", "given", "expected"),
+    [
+        ("", None, "calculated on 2026-01-31"),
+        ("2025-06-30", None, "measured on 2025-06-30"),
+        (
+            "2025-06-30",
+            SimpleNamespace(item=SimpleNamespace(serial_number="7"), certificate=SimpleNamespace(number="")),
+            "measured on 2025-06-30; serial number 7",
+        ),
+    ],
+)
+def test_the_first_page_says_of_what_and_when(measured, given, expected):
+    assert _identity({"created": "2026-01-31T10:00:00+00:00", "measured": measured}, given) == expected
+
+
 @pytest.mark.parametrize(
     ("verdict", "expected"),
     [
+        ("gear is recommended: it predicts.", ("gear is recommended", "It predicts.")),
+        ("As predicted: held-out poses.", ("As predicted", "Held-out poses.")),
         ("To be used with care: d_5; more. U is 1.", ("To be used with care", "d_5; more. U is 1.")),
         ("It gives U (k = 2; at worst 3 mm): so. And more.", ("It gives U (k = 2; at worst 3 mm)", "So. And more.")),
         ("Measured; no limit was given.", ("Measured", "No limit was given.")),
