@@ -15,7 +15,7 @@ from .charts import Marks, Plot
 _CHARACTER = 6.6  # pixels: mean width of one in a label
 _OVERLAP = 16  # pixels: least distance of labels of the vertical axis
 _WHOLE = 'preserveAspectRatio="none" width="100%" height="100%"'
-_LONGEST = 22  # characters of a slanted name; the middle of longer ones is left out
+_LONGEST = 20  # characters of a slanted name; the middle of longer ones is left out
 _NARROW = 280  # pixels: axes on a telephone
 _LINES = ("line", "dashed", "dotted")
 
