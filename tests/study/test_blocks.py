@@ -53,6 +53,7 @@ def test_the_difference_is_named(case):
             check_same(begun, "s.h5", "choose another output path")
 
 
+@pytest.mark.slow
 def test_what_was_begun_otherwise_is_read_but_not_continued(study, tmp_path):
     settings = json.dumps(json.loads(computed_with()) | {"XLA_FLAGS": "--xla_a=1"}, sort_keys=True)
     message = r"s\.h5 was begun with XLA_FLAGS=--xla_a=1, but this process has no XLA_FLAGS"

@@ -95,6 +95,7 @@ def test_a_second_run_at_the_same_time_is_refused(study, tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["s.h5"]
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("change", "message"),
     [
