@@ -304,7 +304,7 @@ export class View {
         const done = place.wanted && place.poses >= place.wanted, next = place.name === this.scene.next;
         pen.dot(at, 7, done ? "good" : "page", next ? "ghost" : "ink", next ? 4 : 2);
       } });
-      if (place.name) this.labels.push({ name: place.name, at, colour: place.name === this.scene.next ? "ghost" : "ink" });
+      this.labels.push({ name: place.name, at, colour: place.name === this.scene.next ? "ghost" : "ink" });
     }
     const colour = (pose) => (pose.shade !== undefined ? `v${pose.shade}`
       : pose.outlier ? "bad" : pose.excluded ? "soft" : "warm");

@@ -1,7 +1,6 @@
 """The elements of a report, independent of how they are shown; tables, charts and views of captures and evaluations."""
 
 import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -127,10 +126,7 @@ def view_of_arm(
     tips = np.asarray(arm.position(capture.q))
     marks = {name: tips[capture.owner == i].mean(axis=0) for i, name in enumerate(capture.names)}
     lines, moving = skeleton(arm, q[chosen]), dict[int, np.ndarray]()
-    bars, things = _bars(capture), list[dict[str, Any]]()
-    for length in capture.lengths:
-        named = {"name": bars[length.start]} if length.start in bars else {}
-        things.append(_thing("bar", [marks[length.start], marks[length.end]], **named))
+    things = [_thing("bar", [marks[length.start], marks[length.end]]) for length in capture.lengths]
     if residuals is None and not capture.observations:
         residuals = tips - np.array([*marks.values()])[owner]
     for i, observation in enumerate(capture.observations, start=len(capture.names)):
@@ -160,7 +156,7 @@ def view_of_arm(
                 pose["residual"] = [float(f"{x:.3g}") for x in residuals[i]]
         poses.append(pose)
     data = {
-        "marks": [{"name": "" if name in bars else name, "at": np.round(at, 1).tolist()} for name, at in marks.items()],
+        "marks": [{"name": name, "at": np.round(at, 1).tolist()} for name, at in marks.items()],
         "things": things,
         "from": "geometry" if capture.observations else "socket's centroid",
         "poses": poses,
@@ -173,15 +169,6 @@ def view_of_arm(
     coloured = Marks("", (), (), limits=limits if distances is not None else (), unit="mm")
     arm_words = "The calibrated arm" if distances is not None else "The arm"
     return ArmView("scene", f"{arm_words}, {what}and its poses", says, data, coloured, legend)
-
-
-def _bars(capture: Capture) -> dict[str, str]:
-    """The name of the bar, by the two sockets that are its ends and alone in their folder ("bar1/a", "bar1/b")."""
-    folders = {name: name.rpartition("/")[0] for name in capture.names}
-    alone = [folder for folder, sockets in Counter(folders.values()).items() if folder and sockets == 2]
-    ends = [(length.start, length.end) for length in capture.lengths]
-    shared = {end for pair in ends if folders[pair[0]] == folders[pair[1]] in alone for end in pair}
-    return {name: folders[name] for name in shared}
 
 
 def _thing(kind: str, points: Any, **more: Any) -> dict[str, Any]:

@@ -895,14 +895,6 @@ def test_the_page_of_an_acceptance_test_has_no_files_that_are_called_as_their_en
         assert table.headings == ["done", "pose", "test", "name", *expected, "x [mm]"]
 
 
-def test_a_bar_is_named_once(paper_arm):
-    q = {name: Q[i : i + 2] for i, name in enumerate(("bar1/a", "bar1/b", "C", "on/a", "on/b", "on/c"))}
-    lengths = [aj.ReferenceLength(*ends, 100.0, 0.01) for ends in (("bar1/a", "bar1/b"), ("on/a", "on/b"))]
-    data = elements.view_of_arm(paper_arm, aj.Capture(q, lengths)).data
-    assert [mark["name"] for mark in data["marks"]] == ["", "", "C", "on/a", "on/b", "on/c"]
-    assert [thing.get("name") for thing in data["things"]] == ["bar1", None]
-
-
 @pytest.mark.parametrize(
     ("measured", "given", "expected"),
     [
