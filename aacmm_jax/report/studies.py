@@ -88,7 +88,9 @@ def _spread(cells: list[dict[str, Any]], name: str) -> tuple[str, str, str]:
     """The medians of a metric over the cells."""
     unit, factor = shown_unit(name)
     known = [factor * cell["figures"][name]["p50"]["value"] for cell in cells if name in cell["figures"]]
-    ends = dict.fromkeys(f"{end:.3g}" for end in (min(known), max(known)))
+    ends = dict.fromkeys(
+        np.format_float_positional(end, 3, unique=False, fractional=False, trim="-") for end in (min(known), max(known))
+    )
     note = "median of the converged trials" + (" of a cell" if len(known) > 1 else "")
     title = metric_title(name).partition(" [")[0]
     return title[:1].upper() + title[1:], f"{' to '.join(ends)} {unit}".strip(), note
