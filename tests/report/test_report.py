@@ -608,7 +608,7 @@ def test_long_names_of_an_axis_have_room():
     plot = charts.Plot(charts.names("", names), charts.linear("y", [0, 1]), ())
     drawn = svg.drawn(plot, "caption")
     assert [words in drawn for words in ("measuring_…on_0/nest", *names)] == [True, False, False, False]
-    below, left = map(float, re.search("padding:6px 12px (.*)px (.*)px", drawn).groups())
+    below, left = map(float, re.search(r"padding:6px 12px ([\d.]+)px ([\d.]+)px", drawn).groups())
     assert below < 150  # pixels
     across = 0.5 * 6.6 * len("measuring_…on_0/nest")  # pixels, of the first name
     assert left + 280 * plot.x.at(0.0) > across  # on a telephone
@@ -900,14 +900,11 @@ def test_the_page_of_an_acceptance_test_has_no_files_that_are_called_as_their_en
     [
         ("", None, "calculated on 2026-01-31"),
         ("2025-06-30", None, "measured on 2025-06-30"),
-        (
-            "2025-06-30",
-            SimpleNamespace(item=SimpleNamespace(serial_number="7"), certificate=SimpleNamespace(number="")),
-            "measured on 2025-06-30; serial number 7",
-        ),
+        ("2025-06-30", {"item": {"serial_number": "7"}}, "measured on 2025-06-30; serial number 7"),
     ],
 )
 def test_the_first_page_says_of_what_and_when(measured, given, expected):
+    given = given and aj.files.AdministrativeData.model_validate(given)
     assert _identity({"created": "2026-01-31T10:00:00+00:00", "measured": measured}, given) == expected
 
 
