@@ -61,6 +61,7 @@ def read():
 ORDINARY = [kind for kind in KINDS if kind != "hostile names"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("language", ["en", "de"])
 @pytest.mark.parametrize("kind", ORDINARY)
 def test_html_and_pdf_say_the_same_on_two_numbered_pages(certificates, read, kind, language):
@@ -79,6 +80,7 @@ def test_html_and_pdf_say_the_same_on_two_numbered_pages(certificates, read, kin
         assert page.format(i) in text
 
 
+@pytest.mark.slow
 def test_the_dcc_comes_out_of_the_pdf_as_it_went_in(certificates, read):
     """It is valid, and the PDF says that it is PDF/A-3, which may hold it."""
     dcc = certificates["all stated"]
@@ -91,6 +93,7 @@ def test_the_dcc_comes_out_of_the_pdf_as_it_went_in(certificates, read):
     assert certificate_pdf(dcc, logo=PNG) == pdf
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ORDINARY)
 def test_every_printed_uncertainty_is_one_of_the_dcc(certificates, kind):
     page = certificate_html(certificates[kind])
@@ -103,6 +106,7 @@ def test_every_printed_uncertainty_is_one_of_the_dcc(certificates, kind):
     assert {(value.replace("−", "-"), u) for value, u in printed} <= set(stated.findall(certificates[kind]))
 
 
+@pytest.mark.slow
 def test_what_a_laboratory_states_is_printed(certificates):
     """Identification, conditions, tests with limit and decision; German with its decimal sign."""
     page = certificate_html(certificates["all stated"], language="de")
@@ -115,6 +119,7 @@ def test_what_a_laboratory_states_is_printed(certificates):
     assert "unentschieden (innerhalb der Grenze)" in texts
 
 
+@pytest.mark.slow
 def test_hostile_names_are_texts_in_both(certificates):
     """In the PDF, or it says that no font has them."""
     page = Texts(certificate_html(certificates["hostile names"]))
@@ -124,6 +129,7 @@ def test_hostile_names_are_texts_in_both(certificates):
         assert certificate_pdf(certificates["hostile names"]).startswith(b"%PDF")
 
 
+@pytest.mark.slow
 def test_another_language_is_one_file(certificates, tmp_path):
     english = (Path(languages.__file__).parent / "en.toml").read_text()
     path = tmp_path / "fr.toml"
@@ -171,6 +177,7 @@ def test_a_logo_is_a_small_png_or_svg_file(tmp_path):
     assert aj.files.read_logo(about) is None
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     "damage", [b"<svg", b"<svg><g></svg>", SVG.replace(b"<rect", b'<image href="/etc/hostname"/><rect')]
 )

@@ -52,6 +52,7 @@ def readings(arm: aj.Arm) -> np.ndarray:
     return np.concatenate([q, random.uniform(10, 30, (4, arm.columns - arm.joints))], axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

@@ -81,6 +81,7 @@ def test_a_worker_with_other_settings_computes_nothing(study, monkeypatch):
         runner._run(study, settings, block, None)
 
 
+@pytest.mark.slow
 def test_the_file_says_what_it_was_computed_with(home):
     with h5py.File(home / "whole.h5") as file:
         kept = json.loads(file.attrs["computed_with"])

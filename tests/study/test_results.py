@@ -156,6 +156,7 @@ def test_factors_are_named_in_words(name, level, text):
     assert level_title(name, level) == text
 
 
+@pytest.mark.slow
 def test_summary_says_what_the_arrays_say(computed, summary):
     data = aj.study.open_study(computed)
     assert summary["factors"] == {"bounds.length_mm": [0.5, 5.0], "bounds.length_shift_mm": [0.0, 1.0]}
@@ -179,6 +180,7 @@ def test_summary_says_what_the_arrays_say(computed, summary):
     assert cell["converged"] == {"value": 1, "se": None}  # no scatter seen is not certainty
 
 
+@pytest.mark.slow
 def test_the_method_is_right(summary):
     """Within wide bounds the scale fix leaves no bias, and every parameter's bias is within its standard error."""
     cell = summary["results"][2]
