@@ -177,7 +177,7 @@ def test_a_logo_is_a_small_png_or_svg_file(tmp_path):
     assert aj.files.read_logo(about) is None
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "damage", [b"<svg", b"<svg><g></svg>", SVG.replace(b"<rect", b'<image href="/etc/hostname"/><rect')]
 )

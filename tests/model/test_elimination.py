@@ -63,6 +63,7 @@ def dense(linear, loss=None):
 PARTS = st.lists(st.sampled_from(sorted(EVERY)), max_size=4)
 
 
+@pytest.mark.slow
 @settings(max_examples=example_count(3), deadline=None)
 @given(PARTS, st.integers(0, 1000))
 def test_the_arrow_is_the_dense_normal_matrix(paper_arm, parts, seed):

@@ -33,7 +33,7 @@ def imported(folder, line=""):
     return aj.files.read_manifest(folder / "capture.toml")
 
 
-@pytest.mark.first_rows(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("there", [False, True])
 def test_columns(folder, there, capsys):
     recording = imported(folder, 'as_found = "installed.toml"\n' if there else "")

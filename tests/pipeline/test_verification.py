@@ -31,7 +31,7 @@ def recording(nominal, true, poses=8, lengths=(), sockets="ABC"):
     )
 
 
-@pytest.mark.first_rows(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("true", "other", "verdict"),
     [(1.0, 0.2, "better"), (1.0, 0.0, "better"), (-1.0, 0.0, "worse"), (0.0, 4.0, "worse"), (0.5, 0.8, "equivalent")],
