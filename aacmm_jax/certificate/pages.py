@@ -1,6 +1,7 @@
 """What the two pages of a printed certificate say, made of a Digital Calibration Certificate (DCC) and nothing else.
 
-What is printed is a choice of what the DCC says, to the digit. Its words are those of a language file.
+What is printed is a choice of what the DCC says, to the digit. Its words are those of a language file; sentences that
+the DCC has in English only are printed in English alone, and other languages refer to them.
 """
 
 import math
@@ -17,6 +18,7 @@ from .xml_elements import CELSIUS, MILLIMETRE, ONE, PREFIXES, RADIAN, root_of
 
 _UNITS = {MILLIMETRE: "mm", RADIAN: "rad", CELSIUS: "°C", ONE: ""}
 _MOST_ROWS, _MOST_FINDINGS, _MOST_JOINTS = 6, 4, 8  # of a table: the certificate has two pages
+_COLUMNS = ("alpha", "a", "d", "theta", "beta")
 _MOST_CHARACTERS = 280  # of a finding
 _VALUE, _UNCERTAINTY = "si:real/si:value", "si:real/si:measurementUncertaintyUnivariate/"
 _STAGES = {"nominal": "nominal parameters", "as_found": "parameters as found", "after": "calibrated parameters"}
@@ -37,7 +39,7 @@ class Section(NamedTuple):
     signatures: Sequence[tuple[str, str]] = ()  # names and roles
 
 
-class Printed(NamedTuple):
+class Pages(NamedTuple):
     """What both pages say."""
 
     language: str
@@ -52,7 +54,7 @@ class Printed(NamedTuple):
     created: str  # date, ISO 8601
 
 
-def pages_of(dcc: str, words: Language) -> Printed:
+def pages_of(dcc: str, words: Language) -> Pages:
     """What both pages say. Raises `InputError` if the text is no DCC of this package."""
     root = root_of(dcc)
     administrative = _first(root, "dcc:administrativeData")
@@ -68,7 +70,7 @@ def pages_of(dcc: str, words: Language) -> Printed:
     }
     if "Calibrated parameters" not in results:
         raise InputError("the certificate has no results by calibrated parameters; give a DCC that aacmm wrote.")
-    return Printed(
+    return Pages(
         language=words.code,
         laboratory=[
             *_address(_first(laboratory, "dcc:contact"), words),
@@ -128,8 +130,9 @@ def _first_page(
         "model": words.stated(item.findtext("dcc:model", "", PREFIXES)),
         "serial_number": words.stated(_identification(item, "Serial number")),
         "customer_number": _identification(item, "Customer's number"),
+        "condition": _content(item, "dcc:description"),
         "customer": "; ".join(_address(_first(administrative, "dcc:customer"), words)),
-        "number": core.findtext("dcc:uniqueIdentifier", "", PREFIXES),
+        "replaces": core.findtext("dcc:reportAmendedSubstituted/dcc:replacedUniqueIdentifier", "", PREFIXES),
         "received": core.findtext("dcc:receiptDate", "", PREFIXES),
         "calibrated": " – ".join(dict.fromkeys(days)),
         "place": words("place_" + core.findtext("dcc:performanceLocation", "other", PREFIXES)),
@@ -138,7 +141,7 @@ def _first_page(
     yield Section(words("identification"), [(words(key), value) for key, value in facts.items() if value])
     described = _content(after.find("dcc:usedMethods/dcc:usedMethod", PREFIXES), "dcc:description")
     counts = [(name.lower(), number) for name, number in re.findall(r"(\w[\w ]*): (\d+)(?=[;.])", described)]
-    counted = ", ".join(words(name, number=number) for name, number in counts if number != "0")
+    counted = ", ".join(words.counted(name, number) for name, number in counts if number != "0")
     software = _first(after, "dcc:usedSoftware/dcc:software")
     name = f"{_content(software, 'dcc:name')} {software.findtext('dcc:release', '', PREFIXES)}"
     yield Section(
@@ -182,11 +185,11 @@ def _equipment(equipment: Element, words: Language) -> list[str]:
     values = "; ".join(_with_u(quantity, words) for quantity in quantities[:3])
     maker = _content(equipment, "dcc:manufacturer/dcc:name"), equipment.findtext("dcc:model", "", PREFIXES)
     return [
-        words(name) if name in words.texts else name,
+        words.known(name, name),
         ", ".join(filter(None, maker)),
         _identification(equipment, "Serial number"),
         _identification(equipment, "Number of its calibration certificate"),
-        values + (f"; {words('more_sentence', count=str(len(quantities) - 3))}" if len(quantities) > 3 else ""),
+        "; ".join([values, *_more(len(quantities) - 3, words)]),
     ]
 
 
@@ -196,11 +199,11 @@ def _with_u(quantity: Element, words: Language) -> str:
     unit = _UNITS.get(unit, unit)
     name = _content(quantity, "dcc:name")
     if name.startswith("standard uncertainty"):  # of what an instrument measured
-        unit = "px" if name.endswith("in pixels") else unit
-        return f"u = {words.number(f'{float(_value(quantity)):.2g}')}\u00a0{unit}"
-    u = quantity.findtext(f"{_UNCERTAINTY}si:standardMU/si:valueStandardMU", None, PREFIXES)
-    number = f"{words.number(_value(quantity))}\u00a0{unit}".strip()
-    return number if u is None else f"{number} (u = {words.number(_short(u))}\u00a0{unit})".replace("\u00a0)", ")")
+        number, unit = f"{float(_value(quantity)):.2g}", "px" if name.endswith("in pixels") else unit
+        return f"u = {words.number(number)} {unit}".replace(" ", "\u00a0")
+    u = quantity.findtext(f"{_UNCERTAINTY}si:standardMU/si:valueStandardMU", "", PREFIXES)
+    with_u = f" (u = {words.number(_short(u))} {unit})".replace(" )", ")") if u else ""
+    return f"{words.number(_value(quantity))} {unit}{with_u}".strip().replace(" ", "\u00a0")
 
 
 def _value(quantity: Element) -> str:
@@ -229,11 +232,14 @@ def _second_page(results: dict[str, Element], statements: dict, words: Language)
               for stage in (_STAGES[before], _STAGES["after"])]  # fmt: skip
     for section in (_repeatability, _lengths, _observations):
         yield from section(stages, before, words)
-    yield from _parameters(stages[1], words)
+    yield from _held_out(stages[1], words)
+    yield from _volume(stages[1], words)
+    yield from _parameters(stages[1], words("parameters"), words)
+    yield from _parameters(stages[0], words("parameters_before", before=words(before)), words)
     if "Scale" in stages[1]:
         k = _first(stages[1]["Scale"], "dcc:data/dcc:quantity")
         expanded, factor = _expanded(k)
-        says = words.number(_value(k) + (f" ± {expanded} (k = {factor})" if expanded else ""))
+        says = words.number(_value(k) + (f" ± {expanded} (k = {factor})".replace(" ", "\u00a0") if expanded else ""))
         yield Section(words("scale"), paragraphs=[words("scale_sentence", k=says)])
     tests = [_named(results.get(f"Acceptance tests, {_STAGES[stage]}"), "dcc:results/dcc:result")
              for stage in (before, "after")]  # fmt: skip
@@ -251,13 +257,36 @@ def _second_page(results: dict[str, Element], statements: dict, words: Language)
             (words("decision_rule"), _content(stated, "dcc:declaration")),
             (words("verdict"), words(stated.findtext("dcc:conformity", "", PREFIXES))),
         ]
-    if facts:
-        yield Section(words("conformity"), facts)
-    found = [_content(x, "dcc:declaration") for name in ("Data left out", "Warning") for x in statements.get(name, ())]
-    if found:
-        shown = [x if len(x) <= _MOST_CHARACTERS else x[:_MOST_CHARACTERS].rpartition(" ")[0] + " ..." for x in found]
-        more = [words("more_sentence", count=str(len(found) - _MOST_FINDINGS))] if len(found) > _MOST_FINDINGS else []
-        yield Section(words("findings"), notes=[*shown[:_MOST_FINDINGS], *more])
+    yield Section(words("conformity"), facts, [] if facts else [words("no_conformity_sentence")])
+    yield from _findings(statements, words)
+
+
+def _findings(statements: dict, words: Language) -> Iterator[Section]:
+    left_out, warnings = (
+        [_content(x, "dcc:declaration") for x in statements.get(name, ())] for name in ("Data left out", "Warning")
+    )
+    found = [*left_out, *warnings]
+    if words.code == "en":
+        notes = [_beginning(sentences) for sentences in found[:_MOST_FINDINGS]]
+        notes += _more(len(found) - _MOST_FINDINGS, words)
+    else:
+        notes = [words("left_out_sentence")] if left_out else []
+        notes += [words.counted("warnings_sentence", str(len(warnings)))] if warnings else []
+    if notes:
+        yield Section(words("findings"), notes=notes)
+
+
+def _beginning(text: str) -> str:
+    """A text, as many whole sentences of it as there is space for, or the beginning of the first."""
+    if len(text) <= _MOST_CHARACTERS:
+        return text
+    beginning = text[:_MOST_CHARACTERS]
+    whole = beginning.rpartition(". ")[0]
+    return f"{whole}." if whole else beginning.rpartition(" ")[0] + " ..."
+
+
+def _more(count: int, words: Language) -> list[str]:
+    return [words.counted("more_sentence", str(count))] if count > 0 else []
 
 
 def _repeatability(stages: list[dict[str, Element]], before: str, words: Language) -> Iterator[Section]:
@@ -285,29 +314,10 @@ def _lengths(stages: list[dict[str, Element]], before: str, words: Language) -> 
         cells = (_number(quantities["calibrated value"], words), _number(earlier, words), _number(error, words))
         size = -math.inf if error is None else abs(float(_value(error)))
         rows.append((size, [name, *cells, words.number(expanded), words.number(factor)]))
-    if rows:
-        largest = sorted(rows, key=lambda row: -row[0])[:_MOST_ROWS]
-        kept = [row for row in rows if any(row is x for x in largest)]
-        yield Section(
-            words("lengths"),
-            headings=[
-                words("length"),
-                words("certified_value"),
-                words("error_before", before=words(before)),
-                words("error"),
-                "U",
-                "k",
-            ],
-            table=[row for _, row in kept],
-            notes=[
-                *([words("by_construction_sentence")] if by_construction else []),
-                *_fewer(len(kept), len(rows), words),
-            ],
-        )
-
-
-def _fewer(shown: int, everything: int, words: Language) -> list[str]:
-    return [words("fewer_sentence", shown=str(shown), all=str(everything))] if shown < everything else []
+    before_and_after = words("error_before", before=words(before)), words("error")
+    headings = words("length"), words("certified_value"), *before_and_after, "U", "k"
+    note = [words("by_construction_sentence")] if by_construction else []
+    yield from _largest(words("lengths"), headings, rows, words, notes=note)
 
 
 def _observations(stages: list[dict[str, Element]], before: str, words: Language) -> Iterator[Section]:
@@ -316,42 +326,70 @@ def _observations(stages: list[dict[str, Element]], before: str, words: Language
     for name, part in lists[1].items():
         both = [_named(x, "dcc:quantity").get("RMS residual") for x in (lists[0].get(name), part)]
         size = 0.0 if both[1] is None else float(_value(both[1]))
-        rows.append((size, [name, _content(part, "dcc:description"), *(_number(x, words) for x in both)]))
+        kind, *_, poses = re.split("[,;] ", _content(part, "dcc:description"))
+        counted = poses.removesuffix(" poses")
+        rows.append((size, [name, words.known(f"kind_{kind}", kind), counted, *(_number(x, words) for x in both)]))
+    headings = words("observation"), words("kind"), words("poses"), words(before), words("after")
+    yield from _largest(words("observations"), headings, rows, words, texts=2)
+
+
+def _largest(
+    title: str,
+    headings: Sequence[str],
+    rows: Sequence[tuple[float, list[str]]],
+    words: Language,
+    texts: int = 1,
+    notes: Sequence[str] = (),
+) -> Iterator[Section]:
+    """A table of rows with their sizes: of many, the largest in their order."""
     if rows:
-        largest = sorted(rows, key=lambda row: -row[0])[:_MOST_ROWS]
-        kept = [row for row in rows if any(row is x for x in largest)]
-        yield Section(
-            words("observations"),
-            headings=[words("observation"), "", words(before), words("after")],
-            table=[row for _, row in kept],
-            texts=2,
-            notes=_fewer(len(kept), len(rows), words),
-        )
+        least = sorted((size for size, _ in rows), reverse=True)[:_MOST_ROWS][-1]
+        kept = [row for size, row in rows if size >= least][:_MOST_ROWS]
+        fewer = words("fewer_sentence", shown=str(len(kept)), all=str(len(rows)))
+        notes = [*notes, *([fewer] if len(kept) < len(rows) else [])]
+        yield Section(title, headings=headings, table=kept, texts=texts, notes=notes)
 
 
-def _parameters(stage: dict[str, Element], words: Language) -> Iterator[Section]:
+def _held_out(stage: dict[str, Element], words: Language) -> Iterator[Section]:
+    quantities = _named(stage.get("Held-out poses"), "dcc:data/dcc:quantity")
+    if quantities:
+        row = [[_number(quantity, words) for quantity in quantities.values()]]
+        yield Section(words("held_out"), headings=[words(name) for name in quantities], table=row, texts=0)
+
+
+def _volume(stage: dict[str, Element], words: Language) -> Iterator[Section]:
+    rows, statistics = [], ("median", "95th percentile", "largest")
+    for name, part in _named(stage.get("Expanded uncertainty"), "dcc:data/dcc:list").items():
+        quantities = _named(part, "dcc:quantity")
+        says = words(name, length=_number(quantities.get("length"), words).removesuffix(words.number(".0")))
+        rows.append([says, *(_number(quantities[key], words) for key in statistics)])
+    if rows:
+        yield Section(words("volume"), headings=[words("quantity"), *map(words, statistics)], table=rows)
+
+
+def _parameters(stage: dict[str, Element], title: str, words: Language) -> Iterator[Section]:
     quantities = _named(stage.get("Denavit-Hartenberg parameters"), "dcc:data/dcc:quantity")
-    factors = {factor for quantity in quantities.values() if (factor := _expanded(quantity)[1])}
-
-    def cell(name: str) -> str:
-        quantity = quantities.get(name)
-        if quantity is None:
-            return ""
-        expanded, text = _expanded(quantity)[0], words.number(_value(quantity))
-        return f"{text} ± {words.number(expanded)}" if expanded else text
-
     joints = sum(bool(re.fullmatch(r"alpha_\d+", name)) for name in quantities)
-    if not 0 < joints <= _MOST_JOINTS:
-        return
-    rows = [[str(i), *(cell(f"{key}_{i}") for key in ("alpha", "a", "d", "theta"))] for i in range(1, joints + 1)]
-    least, most = min(factors, key=float, default=""), max(factors, key=float, default="")
-    stated = words.number(least if least == most else f"{least} – {most}")
-    yield Section(
-        words("parameters"),
-        headings=[words("joint"), "alpha", "a", "d", "theta"],
-        table=[*rows, [words("probe"), *(f"{axis}: {cell(f'probe_{axis}')}" for axis in "xyz"), ""]],
-        notes=[words("parameters_sentence", factors=stated)] if factors else [],
-    )
+    numbers = [str(i) for i in range(1, joints + 1)]
+    shown, factors = {}, set()
+    for name in (f"{key}_{i}" for key in (*_COLUMNS, "probe") for i in (*numbers, *"xyz")):
+        if joints <= _MOST_JOINTS and name in quantities:
+            expanded, factor = _expanded(quantities[name])
+            text = words.number(_value(quantities[name]))
+            shown[name] = f"{text} ± {words.number(expanded)}" if expanded else text
+            factors |= {float(factor)} if factor else set()
+    zero = all(shown.get(f"beta_{i}", "") in ("", words.number("0.0")) for i in numbers)
+    columns = _COLUMNS[:-1] if zero else _COLUMNS
+    rows = [[i, *(shown.get(f"{key}_{i}", "") for key in columns)] for i in numbers]
+    if shown:
+        tip = [f"{axis}: {shown.get(f'probe_{axis}', '')}" for axis in "xyz"]
+        rows.append([words("probe"), *tip, *[""] * (len(columns) - 3)])
+    notes = []
+    if factors:
+        stated = dict.fromkeys(f"{factor:g}" for factor in (min(factors), max(factors)))
+        notes.append(words("parameters_sentence", factors=words.number(" – ".join(stated))))
+        notes += _more(len(quantities) - len(shown), words)
+    yield Section(title, headings=[words("joint"), *columns], table=rows if shown else [], notes=notes)
 
 
 def _tests(

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.certificate import certificate_html, certificate_pdf, languages
+from aacmm_jax.certificate import languages, printed_certificate
 from tests.certificate import dcc_model
 from tests.certificate.conftest import KINDS
 from tests.refusals import assert_refused
@@ -65,10 +65,10 @@ ORDINARY = [kind for kind in KINDS if kind != "hostile names"]
 @pytest.mark.parametrize("kind", ORDINARY)
 def test_html_and_pdf_say_the_same_on_two_numbered_pages(certificates, read, kind, language):
     dcc = certificates[kind]
-    found = read(certificate_pdf(dcc, language=language, logo=SVG))
+    found = read(printed_certificate(dcc, language=language, logo=SVG).pdf())
     pages = [page.extract_text() for page in found.pages]
     assert len(pages) == 2
-    html = Texts(certificate_html(dcc, language=language, logo=SVG)).texts
+    html = Texts(printed_certificate(dcc, language=language, logo=SVG).html()).texts
     assert len(html) > 100
     assert [text for text in html if squeezed(text) not in squeezed("".join(pages))] == []
     number = re.search("<dcc:uniqueIdentifier>(.*)</dcc:uniqueIdentifier>", dcc)
@@ -82,18 +82,18 @@ def test_html_and_pdf_say_the_same_on_two_numbered_pages(certificates, read, kin
 def test_the_dcc_comes_out_of_the_pdf_as_it_went_in(certificates, read):
     """It is valid, and the PDF says that it is PDF/A-3, which may hold it."""
     dcc = certificates["all stated"]
-    pdf = certificate_pdf(dcc, logo=PNG)
+    pdf = printed_certificate(dcc, logo=PNG).pdf()
     attached = read(pdf).attachments
     assert list(attached) == ["dcc.xml"]
     assert attached["dcc.xml"] == [dcc.encode()]
     assert dcc_model.faults(attached["dcc.xml"][0].decode()) == []
     assert b"<pdfaid:part>3</pdfaid:part>" in pdf
-    assert certificate_pdf(dcc, logo=PNG) == pdf
+    assert printed_certificate(dcc, logo=PNG).pdf() == pdf
 
 
 @pytest.mark.parametrize("kind", ORDINARY)
 def test_every_printed_uncertainty_is_one_of_the_dcc(certificates, kind):
-    page = certificate_html(certificates[kind])
+    page = printed_certificate(certificates[kind]).html()
     printed = re.findall(r"(−?[\d.]+) ± ([\d.]+)", page)
     assert len(printed) > 5
     stated = re.compile(
@@ -105,11 +105,11 @@ def test_every_printed_uncertainty_is_one_of_the_dcc(certificates, kind):
 
 def test_what_a_laboratory_states_is_printed(certificates):
     """Identification, conditions, tests with limit and decision; German with its decimal sign."""
-    page = certificate_html(certificates["all stated"], language="de")
+    page = printed_certificate(certificates["all stated"], language="de").html()
     texts = Texts(page).texts
     for text in ("Längenlabor <b>&amp; Söhne</b>", "X'1", "0007", "c <7>", "K 17", "house rule 1", "2026-02-04"):
         assert text in texts, text
-    assert "20,25\u00a0°C (u = 0,1\u00a0°C)" in texts
+    assert "20,25\u00a0°C\u00a0(u\u00a0=\u00a00,1\u00a0°C)" in texts
     assert {"b", "script"}.isdisjoint(Texts(page).tags)
     assert "Konformitätsaussage" in texts
     assert "unentschieden (innerhalb der Grenze)" in texts
@@ -117,11 +117,11 @@ def test_what_a_laboratory_states_is_printed(certificates):
 
 def test_hostile_names_are_texts_in_both(certificates):
     """In the PDF, or it says that no font has them."""
-    page = Texts(certificate_html(certificates["hostile names"]))
+    page = Texts(printed_certificate(certificates["hostile names"]).html())
     assert "script" not in page.tags
     assert any("<script>alert" in text for text in page.texts)
     with contextlib.suppress(aj.InputError):
-        assert certificate_pdf(certificates["hostile names"]).startswith(b"%PDF")
+        assert printed_certificate(certificates["hostile names"]).pdf().startswith(b"%PDF")
 
 
 def test_another_language_is_one_file(certificates, tmp_path):
@@ -129,17 +129,17 @@ def test_another_language_is_one_file(certificates, tmp_path):
     path = tmp_path / "fr.toml"
     french = english.replace('"en"', '"fr"').replace('"Calibration certificate"', '"Certificat d\'étalonnage"')
     path.write_text(french)
-    assert "Certificat d&#39;étalonnage" in certificate_html(certificates["joint"], language=path)
+    assert "Certificat d&#39;étalonnage" in printed_certificate(certificates["joint"], language=path).html()
     wrong = {
         french.replace('probe = "Probe"\n', ""): ["[labels] lacks 'probe'"],
         french.replace("[counts]", 'other = "x"\n[counts]'): ["[sentences] has the unknown key 'other'"],
-        french.replace("{count} more", "more"): ["needs the same names in braces"],
+        french.replace("{number} more", "more"): ["needs the same names in braces"],
         french.replace('"fr"', '"French"'): ["language code"],
     }
     for text, parts in wrong.items():
         path.write_text(text)
-        assert_refused(lambda: certificate_html(certificates["joint"], language=path), path, *parts)
-    assert_refused(lambda: certificate_html(certificates["joint"], language="fr"), "'fr'", "de or en")
+        assert_refused(lambda: printed_certificate(certificates["joint"], language=path).html(), path, *parts)
+    assert_refused(lambda: printed_certificate(certificates["joint"], language="fr").html(), "'fr'", "de or en")
 
 
 @pytest.mark.parametrize(
@@ -151,7 +151,7 @@ def test_another_language_is_one_file(certificates, tmp_path):
     ],
 )
 def test_what_is_no_certificate_is_not_printed(text, parts):
-    assert_refused(lambda: certificate_html(text), *parts)
+    assert_refused(lambda: printed_certificate(text).html(), *parts)
 
 
 def test_a_logo_is_a_small_png_or_svg_file(tmp_path):
@@ -175,4 +175,4 @@ def test_a_logo_is_a_small_png_or_svg_file(tmp_path):
     "damage", [b"<svg", b"<svg><g></svg>", SVG.replace(b"<rect", b'<image href="/etc/hostname"/><rect')]
 )
 def test_a_logo_that_cannot_be_drawn_or_names_a_file_is_one_sentence(certificates, damage):
-    assert_refused(lambda: certificate_pdf(certificates["joint"], logo=damage), "cannot be set as PDF")
+    assert_refused(lambda: printed_certificate(certificates["joint"], logo=damage).pdf(), "cannot be set as PDF")
