@@ -11,7 +11,8 @@ from typing import NamedTuple
 from ..core.errors import InputError, require
 from ..core.text import quoted
 from .languages import language_of
-from .pages import Pages, Section, pages_of
+from .pages import Pages, pages_of
+from .sections import Section
 
 _FOLDER = Path(__file__).parent
 _TYPE_SIZES = (10.0, 9.2, 8.5, 7.8)  # points, the first with which two pages are enough
