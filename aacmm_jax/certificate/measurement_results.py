@@ -185,8 +185,7 @@ def _equipment(
         measured = [Quantity(_MEASURED[unit], np.array([u]), unit) for unit, u in part.u.items() if u]
         key = tuple((quantity.says, *np.asarray(quantity.values).tolist(), quantity.u) for quantity in certified)
         if isinstance(observation, Pixels):
-            target = f"{observation.board}, distance of the points farthest apart"
-            equipment[observation.board,] = ([target], observation.kind, [_size(observation)])
+            equipment[observation.board,] = ([observation.board], observation.kind, [_size(observation)])
         if certified or measured:
             where = (observation.kind, *(key if certified and not measured else (observation.name,)))
             names, _, _ = equipment.setdefault(where, ([], observation.kind, [*certified, *measured]))
@@ -211,7 +210,8 @@ def _equipment(
 def _size(seen: Pixels) -> Quantity:
     """The largest distance between points of a target that a camera sees, and the u of its scale there."""
     size = pdist(np.unique(np.asarray(seen.points)[seen.seen], axis=0)).max(initial=0.0)
-    return Quantity("distance", np.array([float(f"{size:.7g}")]), "mm", float(f"{size * float(seen.u_scale):.2g}"))
+    says = "distance between the points farthest apart"
+    return Quantity(says, np.array([float(f"{size:.7g}")]), "mm", float(f"{size * float(seen.u_scale):.2g}"))
 
 
 def _results(

@@ -315,6 +315,38 @@ def test_observations_are_stated_with_what_is_certified_of_them(observed_record,
     assert "robust loss 'tukey'" in text
 
 
+def test_the_target_of_a_camera_has_its_size_and_the_u_of_its_scale():
+    corners = [[[100, 100], [200, 100], [100, 200], [200, 200]]]
+    points = [[[0, 0, 0], [30, 0, 0], [0, 40, 0], [30, 40, 0]]]
+    named = (0.3, "webcam", "board")
+    seen = aj.data.observations.Pixels(
+        "eye", [[0.1]], corners, points, [[0, 1, 2, 3]], *named, intrinsics=(600, 600, 320, 240), u_scale=1e-3
+    )
+    size = measurement_results._size(seen)
+    assert (size.values.tolist(), size.unit, size.u) == ([50.0], "mm", 0.05)
+
+
+def test_uncertainties_of_tips_and_lengths_are_those_over_the_working_volume(record, certificates):
+    values, volume = parse_dcc(certificates["nothing stated"]), aj.volumetric_uncertainty(aj.uncertainty_of(record))
+    for name, key in (("Tip position", "tip"), ("Measured length", "length_reading")):
+        stated = ("Calibrated parameters", "Expanded uncertainty", f"{name}, over all joint limits")
+        assert values[*stated, "length"].value == volume.length
+        for statistic, words in (("median", "median"), ("95", "95th percentile"), ("largest", "largest")):
+            expected = volume.summary[f"expanded_{key}_{statistic}_mm"]
+            assert values[*stated, words][:2] == (pytest.approx(expected, rel=0.05), MM)  # of two digits
+
+
+def test_held_out_poses_have_their_errors(record):
+    rows = aj.residuals_of(record).select(range(5))
+    values = parse_dcc(
+        dcc_xml(record._replace(held_out=rows._replace(use=("held out",) * 5)), AdministrativeData(), created=CREATED)
+    )
+    stated = ("Calibrated parameters", "Held-out poses")
+    assert values[*stated, "poses"].value == 5
+    assert values[*stated, "RMS distance"].value == pytest.approx(np.sqrt(np.mean(rows.distance**2)), abs=5.1e-6)
+    assert values[*stated, "largest distance"].value == pytest.approx(rows.distance.max(), abs=5.1e-6)
+
+
 @pytest.mark.parametrize("value", [5e-324, -0.0, 1e-5, 0.1, 1 / 3, -123456789.125, 1e99])
 def test_any_number_reads_back(record, value):
     text = dcc_xml(record, AdministrativeData(), created=CREATED)
@@ -405,6 +437,8 @@ def test_what_is_stated_is_in_the_certificate(certificates, full):
         ("coreData", "issueDate"): "2026-02-04",
         ("coreData", "performanceLocation"): "laboratory",
         ("items", "item", "name", "content"): 'arm "7"',
+        ("coreData", "reportAmendedSubstituted", "replacedUniqueIdentifier"): "2025-9",
+        ("items", "item", "description", "content"): "worn & dry",
         ("items", "item", "manufacturer", "name", "content"): "maker",
         ("items", "item", "model"): "X'1",
         ("items", "item", "identifications", "identification", "value"): "0007",

@@ -7,6 +7,7 @@ import unicodedata
 import zlib
 from html.parser import HTMLParser
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
@@ -45,6 +46,10 @@ class Texts(HTMLParser):
     def handle_data(self, data):
         if data.strip() and not self.hidden:
             self.texts.append(data.strip())
+
+
+def page(dcc: str, language: str) -> str:
+    return printed_certificate(dcc, language=language).html()
 
 
 def squeezed(text: str) -> str:
@@ -107,12 +112,41 @@ def test_what_a_laboratory_states_is_printed(certificates):
     """Identification, conditions, tests with limit and decision; German with its decimal sign."""
     page = printed_certificate(certificates["all stated"], language="de").html()
     texts = Texts(page).texts
-    for text in ("Längenlabor <b>&amp; Söhne</b>", "X'1", "0007", "c <7>", "K 17", "house rule 1", "2026-02-04"):
+    stated = ("X'1", "0007", "c <7>", "worn & dry", "2025-9", "K 17", "house rule 1", "2026-02-04")
+    for text in ("Längenlabor <b>&amp; Söhne</b>", *stated):
         assert text in texts, text
     assert "20,25\u00a0°C\u00a0(u\u00a0=\u00a00,1\u00a0°C)" in texts
     assert {"b", "script"}.isdisjoint(Texts(page).tags)
     assert "Konformitätsaussage" in texts
     assert "unentschieden (innerhalb der Grenze)" in texts
+
+
+@pytest.mark.parametrize("kind", ORDINARY)
+def test_findings_are_printed_in_english_and_counted_in_other_languages(certificates, kind):
+    root = ElementTree.fromstring(certificates[kind])
+    found = {
+        content.text.partition(". ")[0]
+        for statement in root.iterfind(".//dcc:statement", dcc_names := {"dcc": "https://ptb.de/dcc"})
+        if statement.findtext("dcc:name/dcc:content", "", dcc_names) in ("Warning", "Data left out")
+        for content in statement.iterfind("dcc:declaration/dcc:content", dcc_names)
+    }
+    english, german = (squeezed("".join(Texts(page(certificates[kind], code)).texts)) for code in ("en", "de"))
+    beginnings = [squeezed(sentence)[:80] for sentence in found]
+    assert sum(text in english for text in beginnings) == min(len(found), 4)
+    assert not any(text in german for text in beginnings)
+    assert ("HinweisederAuswertung" in german) == bool(found)
+
+
+def test_one_is_singular():
+    german = languages.language_of("de")
+    several = [german.counted("other observations", number) for number in ("1", "2")]
+    assert several == ["1 Beobachtung", "2 Beobachtungen"]
+
+
+def test_the_type_of_a_full_page_is_smaller_in_print(certificates):
+    printed = re.compile(r"font-size: ([\d.]+)pt; line-height")
+    sizes = [printed.findall(page(certificates[kind], "en")) for kind in ("nothing stated", "all stated")]
+    assert 7 < float(sizes[1][0]) < float(sizes[0][0]) <= 10
 
 
 def test_hostile_names_are_texts_in_both(certificates):
