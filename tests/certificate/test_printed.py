@@ -123,10 +123,10 @@ def test_what_a_laboratory_states_is_printed(certificates):
 
 @pytest.mark.parametrize("kind", ORDINARY)
 def test_findings_are_printed_in_english_and_counted_in_other_languages(certificates, kind):
-    root = ElementTree.fromstring(certificates[kind])
+    root, dcc_names = ElementTree.fromstring(certificates[kind]), {"dcc": "https://ptb.de/dcc"}
     found = {
-        content.text.partition(". ")[0]
-        for statement in root.iterfind(".//dcc:statement", dcc_names := {"dcc": "https://ptb.de/dcc"})
+        str(content.text).partition(". ")[0]
+        for statement in root.iterfind(".//dcc:statement", dcc_names)
         if statement.findtext("dcc:name/dcc:content", "", dcc_names) in ("Warning", "Data left out")
         for content in statement.iterfind("dcc:declaration/dcc:content", dcc_names)
     }
