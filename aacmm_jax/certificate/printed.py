@@ -5,6 +5,7 @@ import datetime
 import json
 import os
 import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +17,9 @@ from .sections import Section
 
 _FOLDER = Path(__file__).parent
 _TYPE_SIZES = (10.0, 9.2, 8.5, 7.8)  # points, the first with which two pages are enough
-_LINES, _CHARACTERS = 62, 90  # of a page in HTML printed in 10 points: fewer than any font for texts has
+# Of a sheet of the HTML page in a wide font: the largest type and its height in points, ems above the first part, and
+# characters of a line in 10 points.
+_LARGEST, _HEIGHT, _ABOVE, _CHARACTERS = 8.8, 760, 8, 80
 
 
 class PrintedCertificate(NamedTuple):
@@ -48,7 +51,7 @@ class PrintedCertificate(NamedTuple):
             dcc=_data("application/xml", self.dcc.encode()),
             footer=_css(f"{self.pages.title} {self.pages.number}"),
             count=f"{_css(before)} counter(page) {_css(middle)} counter(pages) {_css(after)}",
-            size=min(_TYPE_SIZES[0], *(_TYPE_SIZES[0] * _LINES / _lines(page) for page in self.pages.pages)),
+            sizes=[*map(_print_size, self.pages.pages)],
         )
 
     def pdf(self) -> bytes:
@@ -105,24 +108,29 @@ def printed_certificate(
     return PrintedCertificate(pages_of(dcc, language_of(language)), dcc, None if logo is None else _as_svg(logo))
 
 
-def _lines(page: list[Section]) -> float:
-    """About how many lines of 10 points a page has, with the space between its parts."""
+def _print_size(page: Sequence[Section]) -> float:
+    """The size of type, in points, in which a page is one sheet when HTML is printed, also in a wide font."""
+    widest = max((_width(section) for section in page if section.table), default=1)
+    return min(_LARGEST, _HEIGHT / (_ABOVE + sum(map(_height, page))), 10 * (_CHARACTERS + 12) / widest)
 
-    def wrapped(texts: list[str], characters: int = _CHARACTERS) -> int:
-        return sum(-(-len(text) // characters) for text in texts)
 
-    def rows(section: Section) -> int:
-        width = _CHARACTERS // max(len(section.headings), 1) + 5
-        return sum(max(wrapped([cell], width) for cell in row) for row in (section.headings, *section.table) if row)
+def _height(section: Section) -> float:
+    """About the height of a part of a page, in ems, as certificate.html spaces it."""
 
-    return sum(
-        2.5
-        + wrapped([" " * 30 + value for _, value in section.facts])
-        + wrapped([*section.paragraphs, *section.notes])
-        + rows(section)
-        + 5 * bool(section.signatures)
-        for section in page
-    )
+    def lines(texts: Iterable[str]) -> int:
+        return sum(-(-len(text) // _CHARACTERS) for text in texts)
+
+    rows = lines("  ".join(row) for row in (section.headings, *section.table)) if section.table else 0
+    facts = lines(" " * 30 + value for _, value in section.facts)
+    paragraphs = [*section.paragraphs, *section.notes]
+    texts = 1.2 * lines(paragraphs) + 0.25 * len(paragraphs)
+    return 2.1 + 1.4 * facts + 1.25 * rows + texts + 5.5 * bool(section.signatures)
+
+
+def _width(section: Section) -> int:
+    """Of a table, in characters, with space for 10 of every text, which can be in several lines."""
+    columns = zip(*section.table, strict=True)
+    return sum(2 + (10 if i < section.texts else max(map(len, cells))) for i, cells in enumerate(columns))
 
 
 def _data(kind: str, content: bytes) -> str:

@@ -128,14 +128,17 @@ def test_elements_are_in_the_order_of_the_schema(certificates, kind):
     assert [children(result) for result in root[1]][:2] == [parts.split()] * 2
     core = root[0].find(f"{DCC}coreData")
     dates = "beginPerformanceDate endPerformanceDate performanceLocation"
-    given = f"receiptDate {dates} issueDate" if kind in ("all stated", "hostile names") else dates
+    given = (
+        f"receiptDate {dates} issueDate reportAmendedSubstituted" if kind in ("all stated", "hostile names") else dates
+    )
     languages = "usedLangCodeISO639_1 mandatoryLangCodeISO639_1"
     assert core is not None
     assert children(core) == f"countryCodeISO3166_1 {languages} uniqueIdentifier {given}".split()
     found, left = (contents(certificates[kind], f"*/dcc:measurementResult[{n}]/dcc:results/*/dcc:name") for n in (1, 2))
     observations = kind == "observations"
     assert found == ["Repeatability", "Observations" if observations else "Reference lengths", PARAMETERS]
-    assert left == [*found, "Covariance matrix", *([] if observations else ["Scale"])]
+    later = ["Expanded uncertainty", "Covariance matrix", *([] if observations else ["Scale"])]
+    assert left == [*found, *later]
 
 
 def two_digits(found, value: float, expanded: float) -> None:
@@ -187,8 +190,9 @@ def test_numbers_read_back(record):
     assert [element.text for element in stated] == ["0.01"] * 2  # that of the first; the second is exact
     k = values["Calibrated parameters", "Scale", "k"]
     two_digits(k, record.k, uncertainty.expanded_k())
-    # Three metrics, three numbers for each of two lengths, and 27 parameters, twice; and the scale.
-    assert len(values) == 2 * (3 + 6 + 27) + 1
+    # Three metrics, three numbers for each of two lengths, and 27 parameters, twice; the scale; a length, and
+    # three statistics of tips and of such lengths, in both regions.
+    assert len(values) == 2 * (3 + 6 + 27) + 1 + 2 * 2 * 4
 
 
 def test_the_covariance_matrix_is_a_table(record, certificates):
