@@ -23,21 +23,21 @@ _LARGEST, _HEIGHT, _ABOVE, _CHARACTERS = 8.8, 760, 8, 80
 
 
 class PrintedCertificate(NamedTuple):
-    """The printed certificate of a Digital Calibration Certificate (DCC), to be written as HTML or as PDF."""
+    """The printed certificate of a Digital Calibration Certificate (DCC), to be written as HTML or as PDF.
+
+    Example:
+        >>> text = aj.certificate.dcc_xml(record, aj.files.AdministrativeData(), created="2026-01-31T12:00:00Z")
+        >>> printed = aj.certificate.printed_certificate(text, language="de")
+        >>> print("Kalibrierschein" in printed.html(), printed.pdf()[:8], len(printed.pdf()) < 200_000)
+        True b'%PDF-1.7' True
+    """
 
     pages: Pages
     dcc: str
     logo: bytes | None = None  # SVG
 
     def html(self) -> str:
-        """One HTML page that prints on two sheets; the DCC is a link in it. `InputError` if Jinja is not installed.
-
-        Example:
-            >>> text = aj.certificate.dcc_xml(record, aj.files.AdministrativeData(), created="2026-01-31T12:00:00Z")
-            >>> page = aj.certificate.printed_certificate(text, language="de").html()
-            >>> print("Kalibrierschein" in page)
-            True
-        """
+        """One HTML page that prints on two sheets; the DCC is a link in it. `InputError` if Jinja is not installed."""
         require("report", "a certificate as HTML")
         import jinja2
 
@@ -59,12 +59,6 @@ class PrintedCertificate(NamedTuple):
 
         The type is as small as two pages need, down to 7.8 points. `InputError` if Typst is not installed, a logo
         cannot be drawn, or no font has a character of a name.
-
-        Example:
-            >>> text = aj.certificate.dcc_xml(record, aj.files.AdministrativeData(), created="2026-01-31T12:00:00Z")
-            >>> pdf = aj.certificate.printed_certificate(text).pdf()
-            >>> print(pdf[:8], len(pdf) < 200_000)
-            b'%PDF-1.7' True
         """
         require("certificate", "a certificate as PDF")
         import typst
