@@ -62,6 +62,7 @@ def test_without_redundancy_lengths_have_no_uncertainty(paper_arm, capture):
     assert np.isfinite(aj.evaluate(paper_arm, one_each, noise=NOISE).u).all()
 
 
+@pytest.mark.slow
 def test_a_frame_that_is_kept_shows_a_moved_station(paper_arm):
     box = [[200, -300, 100], [600, 300, 500]]
 

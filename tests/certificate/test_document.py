@@ -48,6 +48,7 @@ def contents(text: str, path: str) -> list[str]:
 # against PTB's Schematron rules, and by the properties tested further down.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_content_model_holds(certificates, kind):
     assert dcc_model.faults(certificates[kind]) == []
@@ -66,6 +67,7 @@ WRONG = [
 ]
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(("old", "new"), WRONG)
 def test_the_content_model_notices_what_is_wrong(certificates, old, new):
     good = certificates["all stated"]
@@ -94,6 +96,7 @@ def test_the_published_schema_notices_what_is_wrong(schema, certificates, old, n
     assert schema.validate_dcc(good.replace(old, new)) != []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_published_schematron_rules_hold(certificates, kind):
     from dcclib import validation
@@ -115,6 +118,7 @@ def test_the_published_schematron_rules_hold(certificates, kind):
 # What holds without either
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_elements_are_in_the_order_of_the_schema(certificates, kind):
     root = ElementTree.fromstring(certificates[kind].encode())
@@ -195,6 +199,7 @@ def test_numbers_read_back(record):
     assert len(values) == 2 * (3 + 6 + 27) + 1 + 2 * 2 * 4
 
 
+@pytest.mark.slow
 def test_the_covariance_matrix_is_a_table(record, certificates):
     """A row a parameter, with the units of the products; enough digits to be symmetric and positive definite."""
     root = ElementTree.fromstring(certificates["nothing stated"])
@@ -220,6 +225,7 @@ def contents_of(element, tag: str) -> list[str]:
 # Acceptance tests and conformity
 
 
+@pytest.mark.slow
 def test_acceptance_results_have_their_conformity_beside_them(evaluation, certificates):
     values = parse_dcc(certificates["all stated"])
     for stage, name in (("nominal", "nominal parameters"), ("calibrated", "calibrated parameters")):
@@ -259,6 +265,7 @@ def test_decisions_in_the_words_of_the_certificate(value, decision, word):
     assert _conformity(MetricValue("x", value, 0.01, None, 0.05, decision)) == word
 
 
+@pytest.mark.slow
 def test_a_conformity_rests_on_results(record, full, evaluation):
     def certificate(tested, verdict):
         stated = full.model_copy(update={"conformity": full.conformity.model_copy(update={"verdict": verdict})})
@@ -287,6 +294,7 @@ def test_values_are_rounded_to_two_digits_of_their_uncertainty(value, u):
     assert abs(float(one.findtext("value") or "nan") - value) <= 0.0501 * 2 * u * 1.06 + 1e-12
 
 
+@pytest.mark.slow
 def test_observations_are_stated_with_what_is_certified_of_them(observed_record, certificates):
     """The values of the artefacts' own certificates: not the distances of the tip's centre."""
     text = certificates["observations"]
@@ -330,6 +338,7 @@ def test_the_target_of_a_camera_has_its_size_and_the_u_of_its_scale():
     assert (size.values.tolist(), size.unit, size.u) == ([50.0], "mm", 0.05)
 
 
+@pytest.mark.slow
 def test_uncertainties_of_tips_and_lengths_are_those_over_the_working_volume(record, certificates):
     values, volume = parse_dcc(certificates["nothing stated"]), aj.volumetric_uncertainty(aj.uncertainty_of(record))
     for name, key in (("Tip position", "tip"), ("Measured length", "length_reading")):
@@ -340,6 +349,7 @@ def test_uncertainties_of_tips_and_lengths_are_those_over_the_working_volume(rec
             assert values[*stated, words][:2] == (pytest.approx(expected, rel=0.05), MM)  # of two digits
 
 
+@pytest.mark.slow
 def test_held_out_poses_have_their_errors(record):
     rows = aj.residuals_of(record).select(range(5))
     values = parse_dcc(
@@ -351,6 +361,7 @@ def test_held_out_poses_have_their_errors(record):
     assert values[*stated, "largest distance"].value == pytest.approx(rows.distance.max(), abs=5.1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [5e-324, -0.0, 1e-5, 0.1, 1 / 3, -123456789.125, 1e99])
 def test_any_number_reads_back(record, value):
     text = dcc_xml(record, AdministrativeData(), created=CREATED)
@@ -365,6 +376,7 @@ def test_any_number_reads_back(record, value):
     assert (read, math.copysign(1, read)) == (value, math.copysign(1, value))
 
 
+@pytest.mark.slow
 def test_parameters_without_an_uncertainty_of_their_own_say_why(record, certificates):
     text = certificates["on bounds"]
     values = parse_dcc(text)
@@ -394,6 +406,7 @@ def test_parameters_without_an_uncertainty_of_their_own_say_why(record, certific
     assert all(left[name] is None and values["Calibrated parameters", PARAMETERS, name].expanded for name in others)
 
 
+@pytest.mark.slow
 def test_priors_and_joint_corrections_are_stated(record):
     """What was assumed is part of the statement on uncertainty, coefficients have their own units."""
     capture = record.recording.capture
@@ -412,6 +425,7 @@ def test_priors_and_joint_corrections_are_stated(record):
     assert "Each joint correction adds its coefficient" in text
 
 
+@pytest.mark.slow
 def test_a_fixed_length_says_so(record):
     i = record.names.index("probe_z")
     parts = ("lower", "upper", "active_stage1", "active", "determined")
@@ -428,6 +442,7 @@ def test_a_fixed_length_says_so(record):
     assert parse_dcc(text)["Calibrated parameters", PARAMETERS, "probe_z"].expanded is None
 
 
+@pytest.mark.slow
 def test_what_is_stated_is_in_the_certificate(certificates, full):
     text = certificates["all stated"]
     root = ElementTree.fromstring(text.encode())
@@ -474,6 +489,7 @@ def test_what_is_stated_is_in_the_certificate(certificates, full):
     ]
 
 
+@pytest.mark.slow
 def test_nothing_is_made_up(record):
     text = dcc_xml(record, AdministrativeData(), created=CREATED)
     root = ElementTree.fromstring(text)
@@ -494,6 +510,7 @@ def test_nothing_is_made_up(record):
     assert names[:2] == ["Scale", "Uncertainty"]
 
 
+@pytest.mark.slow
 def test_what_was_left_out_is_stated(record):
     removed = Removed("station", "T2", ("T2/day", "T2/night"), 45.6, (6, 60), 1e-9, 0.2, 0.1, "theta_3", 12.0)
     text = dcc_xml(record._replace(removed=(removed,)), AdministrativeData(), created=CREATED)
@@ -508,6 +525,7 @@ def test_what_was_left_out_is_stated(record):
     assert_refused(lambda: dcc_xml(hostile, AdministrativeData(), created=CREATED), r"A\x1b", "U+001B")
 
 
+@pytest.mark.slow
 def test_warnings_and_simulations_are_stated(record):
     recording = record.recording
     given = aj.Noise(encoder_arcsec=2.0 / 3, seating=0.005 / 3)
@@ -521,6 +539,7 @@ def test_warnings_and_simulations_are_stated(record):
     assert "The readings are simulated, so this is not a certificate of a real arm." in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stated", "begin", "end"),
     [
@@ -538,6 +557,7 @@ def test_the_day_of_the_calibration_stands_in_for_missing_dates(record, stated, 
     assert f"<dcc:endPerformanceDate>{end}<" in text
 
 
+@pytest.mark.slow
 def test_the_same_calibration_has_the_same_certificate(record):
     one, again = (dcc_xml(record, AdministrativeData(), created=CREATED) for _ in range(2))
     assert one == again
@@ -549,6 +569,7 @@ def test_the_same_calibration_has_the_same_certificate(record):
     assert identifier(one) != identifier(other)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HOSTILE)
 def test_hostile_names_stay_text(record, name):
     record = renamed_sockets(record, name, "B", "C")
@@ -587,6 +608,7 @@ def test_any_text_survives_or_is_refused(text):
 # Refusals
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("changes", "keywords", "parts"),
     [
@@ -608,6 +630,7 @@ def test_what_cannot_be_certified_is_refused(record, changes, keywords, parts):
     )
 
 
+@pytest.mark.slow
 def test_names_that_xml_cannot_hold_are_refused(record):
     assert_refused(
         lambda: dcc_xml(renamed_sockets(record, "A\x1b", "B", "C"), AdministrativeData(), created=CREATED),
@@ -619,6 +642,7 @@ def test_names_that_xml_cannot_hold_are_refused(record):
     assert_refused(lambda: dcc_xml(broken, AdministrativeData(), created=CREATED), r"'\ud800' in", "U+D800")
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("stated", "part"),
     [({"received": "2026-03-06"}, "certificate.received"), ({"issued": "2026-03-04"}, "certificate.issued")],
@@ -690,6 +714,7 @@ def test_what_is_no_certificate_is_refused(text, parts):
     assert_refused(lambda: parse_dcc(text), *parts)
 
 
+@pytest.mark.slow
 def test_a_certificate_whose_number_was_edited_is_refused(record):
     text = dcc_xml(record, AdministrativeData(), created=CREATED)
     k = f"<si:value>{parse_dcc(text)['Calibrated parameters', 'Scale', 'k'].value!r}</si:value>"

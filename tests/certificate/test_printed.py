@@ -66,6 +66,7 @@ def read():
 ORDINARY = [kind for kind in KINDS if kind != "hostile names"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("language", ["en", "de"])
 @pytest.mark.parametrize("kind", ORDINARY)
 def test_html_and_pdf_say_the_same_on_two_numbered_pages(certificates, read, kind, language):
@@ -84,6 +85,7 @@ def test_html_and_pdf_say_the_same_on_two_numbered_pages(certificates, read, kin
         assert page.format(i) in text
 
 
+@pytest.mark.slow
 def test_the_dcc_comes_out_of_the_pdf_as_it_went_in(certificates, read):
     """It is valid, and the PDF says that it is PDF/A-3, which may hold it."""
     dcc = certificates["all stated"]
@@ -96,6 +98,7 @@ def test_the_dcc_comes_out_of_the_pdf_as_it_went_in(certificates, read):
     assert printed_certificate(dcc, logo=PNG).pdf() == pdf
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ORDINARY)
 def test_every_printed_uncertainty_is_one_of_the_dcc(certificates, kind):
     page = printed_certificate(certificates[kind]).html()
@@ -108,6 +111,7 @@ def test_every_printed_uncertainty_is_one_of_the_dcc(certificates, kind):
     assert {(value.replace("−", "-"), u) for value, u in printed} <= set(stated.findall(certificates[kind]))
 
 
+@pytest.mark.slow
 def test_what_a_laboratory_states_is_printed(certificates):
     """Identification, conditions, tests with limit and decision; German with its decimal sign."""
     page = printed_certificate(certificates["all stated"], language="de").html()
@@ -121,6 +125,7 @@ def test_what_a_laboratory_states_is_printed(certificates):
     assert "unentschieden (innerhalb der Grenze)" in texts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ORDINARY)
 def test_findings_are_printed_in_english_and_counted_in_other_languages(certificates, kind):
     root, dcc_names = ElementTree.fromstring(certificates[kind]), {"dcc": "https://ptb.de/dcc"}
@@ -143,12 +148,14 @@ def test_one_is_singular():
     assert several == ["1 Beobachtung", "2 Beobachtungen"]
 
 
+@pytest.mark.slow
 def test_the_type_of_a_full_page_is_smaller_in_print(certificates):
     printed = re.compile(r"\.results { font-size: ([\d.]+)pt")
     sizes = [float(*printed.findall(page(certificates[kind], "en"))) for kind in ("nothing stated", "all stated")]
     assert 6 < sizes[1] < sizes[0] <= 10
 
 
+@pytest.mark.slow
 def test_hostile_names_are_texts_in_both(certificates):
     """In the PDF, or it says that no font has them."""
     page = Texts(printed_certificate(certificates["hostile names"]).html())
@@ -158,6 +165,7 @@ def test_hostile_names_are_texts_in_both(certificates):
         assert printed_certificate(certificates["hostile names"]).pdf().startswith(b"%PDF")
 
 
+@pytest.mark.slow
 def test_another_language_is_one_file(certificates, tmp_path):
     english = (Path(languages.__file__).parent / "en.toml").read_text()
     path = tmp_path / "fr.toml"
@@ -205,6 +213,7 @@ def test_a_logo_is_a_small_png_or_svg_file(tmp_path):
     assert aj.files.read_logo(about) is None
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     "damage", [b"<svg", b"<svg><g></svg>", SVG.replace(b"<rect", b'<image href="/etc/hostname"/><rect')]
 )

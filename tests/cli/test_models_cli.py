@@ -26,6 +26,7 @@ def folder(tmp_path_factory, paper_arm):
     return path
 
 
+@pytest.mark.slow
 def test_models_are_compared(aacmm, folder):
     command = ("compare-models", folder / "c.h5", "--models")
     found = json.loads(aacmm(*command, "dh; gravity; harmonics=1", "--json").stdout)
@@ -40,6 +41,7 @@ def test_models_are_compared(aacmm, folder):
     assert "joint 3, upper half" in shown
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("options", "message"),
     [

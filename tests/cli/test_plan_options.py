@@ -60,6 +60,7 @@ def test_a_robot_by_default(aacmm):
     assert "60" in printed.split("largest tilt [deg]")[1].split("Reference")[0]
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
@@ -81,6 +82,7 @@ def test_refused(aacmm, arguments, text):
     assert text in aacmm(*PLAN, *arguments, expect=2).stderr
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("options", "text"),
     [

@@ -55,6 +55,7 @@ def test_vectors_that_are_columns(vectors, library):
 compiled_frame = jax.jit(fitted_frame)
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("plane", [False, True])
 def test_fitted_frame(vectors, plane):
     """Exact where there is an exact frame, also of points in a plane; never a mirror image."""

@@ -55,6 +55,7 @@ def from_pose(first, last=80):
     return lambda count: ((np.arange(count) >= first) & (np.arange(count) < last)).astype(float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("errors", "code", "concerns", "words"),
     [
@@ -91,6 +92,7 @@ def test_a_sound_capture_has_no_cause(paper_arm, capture):
     assert [finding for finding in findings_of(record) if finding.severity != "note"] == []
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("method", ["two-stage", "joint"])
 def test_a_parameter_that_is_fixed_at_a_wrong_value(paper_arm, capture, method):
     """An angle shows in the poses; a length that is fixed sets the scale of sockets."""
@@ -104,6 +106,7 @@ def test_a_parameter_that_is_fixed_at_a_wrong_value(paper_arm, capture, method):
     assert "--free alpha_3" in first.advice
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("stated", [(), ("parameters",)])
 def test_it_is_freed_where_nobody_stated_that_it_is_fixed(paper_arm, capture, stated):
     held = (*aj.Parameters.free_of(paper_arm).held, "alpha_3")
@@ -140,6 +143,7 @@ def test_one_of_two_lengths_is_mistyped(paper_arm):
     assert not any("compliant" in finding.sentence for finding in others)
 
 
+@pytest.mark.slow
 def test_lengths_that_all_scatter_accuse_no_single_one(paper_arm):
     """As errors of places make them scatter on a real arm."""
     pairs = [("A", "B"), ("C", "D"), ("A", "C"), ("B", "D"), ("A", "D"), ("B", "C")]

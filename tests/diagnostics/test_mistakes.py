@@ -69,6 +69,7 @@ def late(q):
 FIRST_POSES = ("A pose 1", "B pose 1", "C pose 1")
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("mistake", "poses", "says"),
     [
@@ -102,6 +103,7 @@ def record_of(nominal, capture):
     return aj.calibrate_capture(aj.Recording(capture, nominal), automatic=False, cross_validate=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changed", "says", "concerns"),
     [

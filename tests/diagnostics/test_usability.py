@@ -57,6 +57,7 @@ def made(readings, changed, stated=None):
     return aj.calibrate_capture(recording, automatic=False, cross_validate=False)
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("changed", "stated", "severity", "reason"),
     [

@@ -128,6 +128,7 @@ HOSTILE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("change", "part"), HOSTILE.values(), ids=HOSTILE.keys())
 def test_nothing_leads_out_of_a_file(path, change, part, monkeypatch):
     """Whoever makes such a file on purpose can seal it, too."""
@@ -139,6 +140,7 @@ def test_nothing_leads_out_of_a_file(path, change, part, monkeypatch):
     assert_refused(lambda: read_tables(path, KIND), path, part, "give a file written by aacmm")
 
 
+@pytest.mark.slow
 def test_many_texts_that_are_one(path, monkeypatch):
     """Text is counted while it is read: a thousand elements may refer to the same long text."""
     write_tables(path, "capture", {"t": Table(columns("row", name=(["é" * 40] * 2000, "", "name")))}, {})

@@ -136,6 +136,7 @@ def test_visits_of_sessions_and_targets(tmp_path, motion):
         read(tmp_path, HEAD + ANGLES + socket.format("A") + 'target = "ball"\n' + other)
 
 
+@pytest.mark.first_rows(4)
 @pytest.mark.parametrize(
     ("angles", "reading"),
     [
@@ -232,6 +233,7 @@ FILES = (
 )
 
 
+@pytest.mark.first_rows(5)
 @pytest.mark.parametrize(
     ("name", "file", "exclude", "expected"),
     [
@@ -289,6 +291,7 @@ LENGTH = '[[length]]\nfrom = "a"\nto = "b"\nvalue = 200.0\n'
 PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
 
 
+@pytest.mark.first_rows(16)
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
@@ -477,6 +480,7 @@ def test_bad_manifest(tmp_path, motion, text, parts):
     assert_refused(lambda: read(tmp_path, text), tmp_path / "capture.toml", *parts)
 
 
+@pytest.mark.first_rows(9)
 @pytest.mark.parametrize(
     ("content", "parts"),
     [

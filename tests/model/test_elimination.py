@@ -84,6 +84,7 @@ def test_the_arrow_is_the_dense_normal_matrix(paper_arm, parts, seed):
     np.testing.assert_allclose(scaled.damped_solution(right, fixed, damping), expected, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", LOSSES)
 def test_a_robust_cost_is_that_of_its_residuals(paper_arm, loss):
     linear = problem(paper_arm, ["sphere", "points"], 3)
@@ -102,6 +103,7 @@ def test_a_robust_cost_is_that_of_its_residuals(paper_arm, loss):
     assert less.max() > 0
 
 
+@pytest.mark.slow
 @settings(max_examples=example_count(3), deadline=None)
 @given(PARTS, st.integers(0, 1000))
 def test_covariances_of_eliminated_geometry_are_the_dense_ones(paper_arm, parts, seed):

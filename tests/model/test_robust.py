@@ -57,6 +57,7 @@ def test_bounded_squares_of_normal_residuals(rows):
     assert expected == pytest.approx(distribution.expect(lambda x: np.minimum(x, most)) / rows, abs=1e-5)
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("name", LOSSES)
 def test_cost_weight_and_transformed_residual(name):
     """The weight is the derivative of the cost by half the square; transformed residuals have that cost."""
@@ -72,6 +73,7 @@ def test_cost_weight_and_transformed_residual(name):
     assert np.all(np.diff(weight[np.argsort(np.sum(white**2, axis=0))]) <= 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LOSSES)
 def test_the_curvature_is_that_of_the_cost(name):
     """Along a residual and across it, up to where it is no longer positive."""

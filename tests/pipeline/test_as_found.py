@@ -33,6 +33,7 @@ def imported(folder, line=""):
     return aj.files.read_manifest(folder / "capture.toml")
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("there", [False, True])
 def test_columns(folder, there, capsys):
     recording = imported(folder, 'as_found = "installed.toml"\n' if there else "")
@@ -58,6 +59,7 @@ def test_columns(folder, there, capsys):
         assert ("as found" in (folder / "r.html").read_text(encoding="utf-8")) == there
 
 
+@pytest.mark.slow
 def test_terminal(folder, aacmm):
     imported(folder, 'as_found = "installed.toml"\n')
     aacmm("import", "capture.toml", "-o", "c.h5")

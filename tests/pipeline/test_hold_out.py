@@ -33,6 +33,7 @@ def calibrated(arms, seed=0, observations=(), **options):
     return aj.calibrate_capture(recorded(arms, seed, observations), noise=NOISE, automatic=False, **options)
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("hold_out", "counts"),
     [
@@ -48,6 +49,7 @@ def test_a_share_of_each_observation_or_a_group_is_held_out(arms, hold_out, coun
     assert {name: int(mask.sum()) for name, mask in masks.items() if mask.any()} == counts
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -83,6 +85,7 @@ def test_held_out_poses_are_compared_with_the_position_that_the_others_have(arms
         assert np.allclose(tips - position, rows.residual[of_socket], atol=1e-9)
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("method", ["two-stage", "joint"])
 @pytest.mark.parametrize("hold_out", [0.3, "b"])
 def test_distances_are_as_large_as_predicted(arms, method, hold_out):
@@ -126,6 +129,7 @@ def test_held_out_residuals_are_kept_in_the_file(arms, tmp_path):
     assert np.array_equal(before.u, after.u)
 
 
+@pytest.mark.slow
 def test_an_evaluation_lists_the_poses_too(arms):
     record = calibrated(arms, hold_out="b")
     rows = aj.residuals_of(aj.evaluate_capture(record, recorded(arms)))

@@ -31,6 +31,7 @@ def recording(nominal, true, poses=8, lengths=(), sockets="ABC"):
     )
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("true", "other", "verdict"),
     [(1.0, 0.2, "better"), (1.0, 0.0, "better"), (-1.0, 0.0, "worse"), (0.0, 4.0, "worse"), (0.5, 0.8, "equivalent")],
@@ -47,6 +48,7 @@ def test_verdicts(true, other, verdict):
         assert checked.volume < 0.3 * checked.nominal.rms
 
 
+@pytest.mark.slow
 def test_a_difference_that_does_not_matter_is_shown_by_enough_poses():
     """The ratio of the true errors over all joint limits, with base and tip fitted, is 1.03 for the first, and 1.36 for
     the second, of which few poses in one place do not show that it is within the margin."""
@@ -58,6 +60,7 @@ def test_a_difference_that_does_not_matter_is_shown_by_enough_poses():
     assert verification_summary(near, "", "")["says"].startswith("No difference that matters")
 
 
+@pytest.mark.slow
 def test_poses_in_one_place_do_not_decide_about_the_working_volume():
     nominal, real, delivered = arms(1, 0.0, 1.0)
     checked = aj.verify(recording(nominal, real, sockets="AB"), delivered)
@@ -65,6 +68,7 @@ def test_poses_in_one_place_do_not_decide_about_the_working_volume():
     assert "Record poses in other places" in verification_summary(checked, "", "")["poses_say"]
 
 
+@pytest.mark.slow
 def test_a_board():
     """The noise of many corners knows no arm, and is not taken for that of the poses."""
     nominal, real, delivered = arms(1, 1.0, 0.2)
@@ -80,6 +84,7 @@ def test_a_board():
     assert checked.recalibrated < checked.nominal.rms
 
 
+@pytest.mark.slow
 def test_exchanged_arms_have_the_opposite_verdict():
     nominal, real, delivered = arms(2, 1.0, 0.3)
     forward = aj.verify(recording(nominal, real), delivered)
@@ -89,6 +94,7 @@ def test_exchanged_arms_have_the_opposite_verdict():
     assert backward.nominal.rms == pytest.approx(forward.delivered.rms)
 
 
+@pytest.mark.slow
 def test_what_is_counted():
     """Two sockets: 3 coordinates a pose, less the tip and two positions; a length is one more equation."""
     nominal, real, delivered = arms(3, 1.0, 0.3)
@@ -103,6 +109,7 @@ def test_what_is_counted():
     assert (tracked.poses, tracked.equations, tracked.unknowns) == (8, 24, 9)
 
 
+@pytest.mark.slow
 def test_the_same_parameters_are_said_to_be_the_same():
     nominal, real, _ = arms(4, 1.0, 0.0)
     checked = aj.verify(recording(nominal, real), nominal)
@@ -141,6 +148,7 @@ def test_equally_good_parameters_are_told_apart_as_rarely_as_stated():
     assert np.mean(decided) < 0.05 + 2 * np.sqrt(0.05 * 0.95 / 400)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_verified():
     nominal, real, delivered = arms(5, 1.0, 0.3)
     recorded = recording(nominal, real)

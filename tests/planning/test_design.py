@@ -136,6 +136,7 @@ def test_poses_can_be_taken(paper_arm, given):
     assert float(length.value) == pytest.approx(np.linalg.norm(points[1] - points[0]))
 
 
+@pytest.mark.slow
 def test_predictions_are_those_of_calibrations(paper_arm, given):
     """The prediction is the uncertainty of a joint calibration on the planned capture."""
     bounds = aj.Bounds.around(paper_arm, aj.Parameters.free_of(paper_arm))
@@ -145,6 +146,7 @@ def test_predictions_are_those_of_calibrations(paper_arm, given):
     assert np.median(volume.u_length) == pytest.approx(given.predicted.median, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_plan_is_better_than_random_poses_and_ten_more_are_better_still(given):
     assert given.predicted.largest < 0.9 * given.random.largest
     assert given.predicted.median < given.random.median
@@ -152,6 +154,7 @@ def test_a_plan_is_better_than_random_poses_and_ten_more_are_better_still(given)
     assert given.loose.largest == pytest.approx(given.predicted.largest, rel=0.1)
 
 
+@pytest.mark.slow
 def test_placements_are_in_the_region_and_the_range(paper_arm, quick):
     region = {"z": (100.0, 900.0), "distance": (300.0, 1200.0)}
     reported = []
@@ -192,11 +195,13 @@ def test_placements_keep_off_the_end_of_the_reach(paper_arm):
     assert inspect.signature(aj.planning.plan_kit).parameters["farthest"].default == defaults
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_plan(paper_arm, quick):
     one, other = (aj.planning.plan(paper_arm, sockets=2, poses=12, candidates=200, seed=3) for _ in range(2))
     np.testing.assert_array_equal(one.q, other.q)
 
 
+@pytest.mark.slow
 def test_files(given, tmp_path):
     save_plan(tmp_path / "plan.csv", given)
     lines = (tmp_path / "plan.csv").read_text().splitlines()
@@ -211,6 +216,7 @@ def test_files(given, tmp_path):
     assert sum(row["poses"] for row in summary["sockets"]) == 20
 
 
+@pytest.mark.slow
 def test_readings_taken_by_the_plan_come_back_through_its_manifest(paper_arm, given, tmp_path):
     (tmp_path / "capture.toml").write_text(plan_manifest(given, "cheng2018-simulation"))
     for name, q in given.capture().sockets.items():

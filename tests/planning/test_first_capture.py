@@ -24,6 +24,7 @@ def test_a_still_first_joint_hides_the_link_after_it(paper_arm):
     assert all(lost is None or lost for lost in still)
 
 
+@pytest.mark.slow
 def test_predictions_follow_poses_and_noise(paper_arm, monkeypatch):
     monkeypatch.setattr(planned, "_PLACEMENTS", 2)
     noise = Noise(encoder_arcsec=2.0, seating=0.005)
@@ -56,6 +57,7 @@ def planar(limits):
     return aj.Arm(alpha=[np.pi / 2, 0, 0], a=[0, 300, 100], d=[200, 0, 0], limits=[(-3, 3), (-3, 3), limits])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("elbow", "nearest", "farthest"),
     [

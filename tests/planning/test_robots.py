@@ -78,6 +78,7 @@ def test_random_configurations_are_of_the_chains_asked_for_and_leave_the_others_
     assert len(joint_weights(TWO)) == TWO.joints
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("make", "match"),
     [

@@ -20,6 +20,7 @@ from aacmm_jax.plot.lengths import tried_shades
 from aacmm_jax.report import elements, write_report
 from aacmm_jax.report.html_page import _origin
 from aacmm_jax.summaries.tables import Table, decimals_for, format_number, number
+from tests.conftest import SLOW
 from tests.refusals import assert_refused
 from tests.written_study import write_study
 
@@ -35,7 +36,7 @@ STUDY = {
 }
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", params=SLOW)
 def written(tmp_path_factory, observed_record, camera_records):
     """The files and reports of a simulated arm with hostile names: calibration, evaluation, study; and of a calibration
     from observations, two of which have hostile names."""
@@ -141,6 +142,7 @@ def page(request, written):
     return found
 
 
+@pytest.mark.first_rows(3)
 def test_text_of_people_never_becomes_markup(page):
     tags = [tag for tag, _ in page.elements]
     assert "img" not in tags
@@ -222,6 +224,7 @@ def tables_of(report):
     return found
 
 
+@pytest.mark.slow
 def test_numbers_of_a_report_are_under_the_right_heading(written):
     from aacmm_jax.report.calibration import calibration_report
 
@@ -334,6 +337,7 @@ def test_a_report_of_a_camera(camera_records):
         assert [mark["name"] for mark in scene.data["marks"]] == [observation.still]
 
 
+@pytest.mark.slow
 def test_a_report_says_what_was_decided_by_default(observed_record):
     from aacmm_jax.report.calibration import calibration_report
 
@@ -355,6 +359,7 @@ def test_a_report_says_what_was_left_out(observed_record):
     assert removal(record.removed[0]).says.startswith("Left out: station T2")
 
 
+@pytest.mark.slow
 def test_groups_held_out_are_listed_one_by_one_the_worst_first(written):
     from aacmm_jax.calibration.agreement import CrossValidation, LeftOut
     from aacmm_jax.report.calibration import calibration_report
@@ -391,6 +396,7 @@ def test_a_report_says_where_the_scale_comes_from(observed_record, observed_repo
     assert "not traceable" in said
 
 
+@pytest.mark.slow
 def test_lengths_of_a_report_by_arm_and_with_expanded_uncertainty(written):
     """The recording has two lengths, so that none is zero by construction."""
     from aacmm_jax.report.calibration import calibration_report
@@ -452,6 +458,7 @@ decision_rule = "a rule"
 """
 
 
+@pytest.mark.slow
 def test_a_statement_that_the_file_contradicts_is_refused(written, tmp_path):
     from aacmm_jax.acceptance.record import PointsRecord
     from aacmm_jax.files.evaluations import save_evaluation
@@ -503,6 +510,7 @@ def test_observations_of_an_evaluation_stand_beside_their_prediction():
     assert observation_tables({"held_out": None, "identified_from": {"observations": []}}) == []
 
 
+@pytest.mark.slow
 def test_charts_of_an_evaluation(written):
     from aacmm_jax.report.evaluation import evaluation_report
 
@@ -518,6 +526,7 @@ def test_charts_of_an_evaluation(written):
     assert [words for _, words in readings.x.ticks] == [f"{HOSTILE} – C"]
 
 
+@pytest.mark.slow
 def test_a_verdict_is_marked_as_what_it_is(written):
     from aacmm_jax.acceptance.record import PointsRecord
     from aacmm_jax.report.calibration import calibration_report
@@ -638,6 +647,7 @@ role = "calibration engineer"
 """
 
 
+@pytest.mark.slow
 def test_the_command_states_the_laboratory_and_prints_for_machines(written, aacmm, tmp_path):
     (tmp_path / "about.toml").write_text(ABOUT)
     done = aacmm("report", written.folder / "calibration.h5", "-o", "report.html", "--about", "about.toml", "--json")
@@ -860,6 +870,7 @@ def test_the_origin_names_a_seed_where_there_is_one(tmp_path, seed):
 # --- Plans and drift ---
 
 
+@pytest.mark.slow
 def test_a_plan_has_a_page_for_the_machine(tmp_path, paper_arm):
     plan = aj.planning.plan(
         paper_arm, sockets={HOSTILE: (400, 200, 300), "B": (700, 500, 500)}, lengths=[(HOSTILE, "B", 0.002)], poses=12,
@@ -889,6 +900,7 @@ def test_the_headline_of_a_verdict(verdict, expected):
     assert elements.Report("", "", verdict, "good", [], [], None, [], []).headline == expected
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("observation", "kinds"),
     [

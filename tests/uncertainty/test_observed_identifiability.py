@@ -53,6 +53,7 @@ CASES = {
 }
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("case", "noise"),
     [
@@ -160,6 +161,7 @@ def test_lengths_of_measured_sockets_weigh_as_their_poses_scatter(paper_arm):
     np.testing.assert_allclose(by_sigma, agreeing.eliminated().relations / (0.01 * np.sqrt(2 / 20)), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_calibrate_warns_of_what_observations_leave_open(paper_arm):
     simulated = kinds.SimulatedPoints("T", BOX, 60, FRAME, u=0.01)
     capture = aj.simulate(paper_arm, {}, observations=[simulated], noise=NOISE, seed=3)

@@ -13,6 +13,7 @@ FRAME = (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0)
 LAST = {"alpha_6", "a_6", "d_6", "theta_6", "probe_x", "probe_y", "probe_z"}
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("observation", "wrist"),
     [

@@ -68,6 +68,7 @@ def test_kuka_axes_get_the_offsets_at_mastering(tmp_path):
     assert "REAL $MAMES[3]=120.171887 ;axis 3\r\n" in changed.text
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_ros_calibration_as_yourdfpy_reads_it(tmp_path):
     text = FILE.read_text().replace('<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><calibration falling="0.25"/>', 1)
