@@ -35,6 +35,7 @@ LONG = {
     "aj.acceptance.plan_procedure",
     "aj.acceptance.simulate_procedure",
     "aj.bootstrap",
+    "aj.calibrate_capture",
     "aj.calibrate_many",
     "aj.pipeline.ComparedModels",
     "aj.compare_models",
@@ -60,6 +61,7 @@ LONG = {
     "aj.plot.save_arm_figure",
     "aj.plot.save_drift_trend",
     "aj.report.write_report",
+    "aj.residuals_of",
     "aj.uncertainty.Uncertainty",
     "aj.volumetric_uncertainty",
 }

@@ -188,6 +188,7 @@ def test_observations_that_several_use_are_shared(paper_arm):
     assert (4, 5) in groups  # both stations at once
 
 
+@pytest.mark.slow
 def test_groups_do_not_change_the_rows(paper_arm):
     """Sockets evaluated at once and one by one."""
     linear = problem(paper_arm, [], 2)

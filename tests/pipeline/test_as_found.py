@@ -74,6 +74,7 @@ def test_another_arm_is_refused(folder):
     assert_refused(lambda: imported(folder, 'as_found = "so100"\n'), "as_found", "5 joints", "6")
 
 
+@pytest.mark.slow
 def test_a_report_without_tests_states_no_conformity(folder):
     record = aj.calibrate_capture(imported(folder), automatic=False, cross_validate=False)
     aj.files.save_calibration(folder / "k.h5", record)

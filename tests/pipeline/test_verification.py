@@ -147,6 +147,7 @@ def test_the_standard_error_is_that_of_leaving_out_each_pose():
     assert found.u == pytest.approx(np.sqrt(11 / 12 * np.sum((np.array(shares) - whole) ** 2)))
 
 
+@pytest.mark.slow
 def test_equally_good_parameters_are_told_apart_as_rarely_as_stated():
     random = np.random.default_rng(1)
     decided = [_paired(*drawn(random, 0.5)).verdict != "not decided" for _ in range(400)]
