@@ -86,11 +86,12 @@ def _serve(session: Any, port: int, others: bool, browser: bool) -> None:
     import contextlib
     import secrets
     import socket
-    import threading
+    import time
 
     import typer
 
     from ..live.server import opened, serving
+    from ..live.shown import not_answering
 
     # A token of the user's own would stand in the list of processes, where other users read it.
     where = {"host": "0.0.0.0", "token": secrets.token_urlsafe(24)} if others else {}
@@ -100,5 +101,9 @@ def _serve(session: Any, port: int, others: bool, browser: bool) -> None:
             typer.echo(f"From other computers: {address.replace('127.0.0.1', socket.gethostname(), 1)}")
         if browser and not stack.enter_context(opened(address)):
             typer.echo("No browser was found here; open the address in one.")
+        told: set[str] = set()
         with contextlib.suppress(KeyboardInterrupt):
-            threading.Event().wait()
+            while True:
+                for text in not_answering(session.state()["live"]["devices"], told):
+                    typer.echo(text)
+                time.sleep(1.0)

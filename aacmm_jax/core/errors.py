@@ -42,7 +42,10 @@ def require(extra: str, use: str, package: str | None = None) -> None:
     package = package or _PACKAGES[extra]
     if importlib.util.find_spec(package) is None:
         # Double quotes are right in every shell, cmd.exe included.
-        raise MissingExtra(f'{use} needs {package}; install {package} with: pip install "aacmm_jax[{extra}]"')
+        raise MissingExtra(
+            f'{use} needs {package}; install the extra {extra}: pip install "aacmm_jax[{extra}]", or in a clone: '
+            f'pip install ".[{extra}]"'
+        )
 
 
 class IdentifiabilityWarning(UserWarning):

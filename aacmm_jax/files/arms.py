@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -188,6 +189,11 @@ def read_arm(
         return read_ur_kinematics(path, probe=probe), False
     if suffix != ".toml" and not os.path.exists(path):
         names = shipped_arms()
+        if re.fullmatch(r"so[-_]?(arm)?[-_]?101", str(source).lower()):
+            raise InputError(
+                f"'{source}' does not ship with the package, and so100 has other zeros; give the URDF of the "
+                "SO-101 (arm = 'so101.urdf', tip = 'gripper_frame_link')."
+            )
         raise InputError(
             f"'{source}' is neither a file nor an arm that ships with the package"
             f"{nearest(str(source), names, most=len(names))}"

@@ -106,7 +106,7 @@ def reading_columns(
     def stated_by(columns: Sequence[int]) -> str:
         return line.format(", ".join(str(i + 1) for i in columns))
 
-    titles = [bare_name(title) for title in table.header]
+    titles = [bare_name(title).removesuffix(".pos") for title in table.header]  # as LeRobot names its motors' positions
     if len(names) == joints and all(titles.count(name) == 1 for name in names):
         picked = [titles.index(name) for name in names]
         _check_not_taken(table, picked, taken)

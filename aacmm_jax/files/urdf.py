@@ -201,7 +201,8 @@ def urdf_of(arm: Arm, nominal: ArmSpecification) -> ExportedUrdf:
     """
     if nominal.urdf is None:
         raise InputError(
-            "the nominal arm was not read from a URDF or MJCF, so a URDF cannot be exported; choose --format toml."
+            "the nominal arm was not read from a URDF or MJCF, so a URDF cannot be exported; choose --format toml, or "
+            "import the readings again with the URDF of the robot as the arm (arm = 'robot.urdf', tip = '...')."
         )
     source, probes = nominal.urdf, np.asarray(nominal.arm.probe).reshape(-1, 3)
     wanted = {"joints": single(arm).joints, "chains": [name for name, _ in arm.chains]}

@@ -93,8 +93,9 @@ def geometry_of(arm: Arm) -> Geometry:
     one_chain(arm, "this format")
     if arm.corrections is not None:
         raise InputError(
-            "the arm has joint corrections, which this format cannot store; write TOML, write only the joint zero "
-            "offsets (--format offsets), or correct the commanded poses (aacmm correct)."
+            "the arm has joint corrections, which this format cannot store; calibrate again with --model dh, write "
+            "TOML, write only the joint zero offsets (--format offsets), or correct the commanded poses (aacmm "
+            "correct)."
         )
     return jax.tree.map(np.asarray, arm.geometry)
 

@@ -33,6 +33,20 @@ def links_of(arm: Arm, q: Float[np.ndarray, " n"]) -> list[list[float]]:
     return [point.tolist() for point in (points[0], *apart)]
 
 
+def not_answering(devices: Sequence[dict[str, Any]], told: set[str]) -> list[str]:
+    """A sentence for each device that does not answer, once until it has answered; ``told`` has their names."""
+    told -= {device["name"] for device in devices if device["connected"]}
+    silent = [d for d in devices if not d["connected"] and d["message"] and d["name"] not in told]
+    told |= {device["name"] for device in silent}
+    return [
+        printable(
+            f"{device['name']} does not answer: {device['message']}. Check its cable and supply, that no other program "
+            "uses it, and --device; the capture begins as soon as it answers (Ctrl-C ends)."
+        )
+        for device in silent
+    ]
+
+
 def shown_readings(arm: Arm, q: Float[np.ndarray, " n"]) -> list[float]:
     """Readings in degrees, or mm of prismatic joints."""
     return (q * np.array(by_joint(arm, _DEGREES, 1.0))).tolist()

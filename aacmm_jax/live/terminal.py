@@ -12,6 +12,7 @@ from typing import Any
 from ..core.errors import InputError
 from ..core.text import printable
 from .session import Session
+from .shown import not_answering
 
 KEYS = "space take   u undo   x exclude   n another pose   s new session   a automatic   f finish   q quit"
 _POSES = 8  # of the last ones that are shown
@@ -29,6 +30,7 @@ def show(session: Session, calibrate: bool = True) -> list[str]:
     console = Console()
     written: list[str] = []
     message, sound, counted = "", session.state()["sound"], 0
+    told: set[str] = set()
     with _keys() as keys, contextlib.ExitStack() as stack:
         live = None
         if console.is_terminal:
@@ -41,6 +43,8 @@ def show(session: Session, calibrate: bool = True) -> list[str]:
                 for pose in state["poses"][counted:]:
                     print(f"pose {pose['number']} in {printable(pose['place'])}", flush=True)
                 counted = len(state["poses"])
+                for text in not_answering(state["live"]["devices"], told):
+                    print(printable(text), flush=True)
             if state["sound"] != sound:
                 sound = state["sound"]
                 if live is not None:

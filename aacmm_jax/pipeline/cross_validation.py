@@ -164,6 +164,12 @@ def cross_validate(
                 )
     elif can_cross_validate(capture, count):
         parts = _parts_of(capture)
+    elif capture.observations and not capture.sizes and len(groups_of(capture)) == 1:
+        raise InputError(
+            f"cross-validation of one observation holds out {2**_HALVINGS} regions of joint space, which needs at "
+            f"least {2**_HALVINGS * _POSES_A_REGION} poses, and enough of them without any region; record "
+            "more poses, or turn cross-validation off (--no-cross-validate)."
+        )
     else:
         raise InputError(
             "cross-validation holds out sockets together with their reference lengths, so at least two groups of "

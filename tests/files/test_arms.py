@@ -230,6 +230,7 @@ def test_what_is_not_an_arm_file(tmp_path):
     assert_refused(
         lambda: aj.load_arm(written(tmp_path, craig)), "beta", "only with convention = 'standard'", "remove beta"
     )
+    assert_refused(lambda: aj.load_arm("so101"), "'so101' does not ship", "so100 has other zeros", "URDF of the SO-101")
     assert_refused(lambda: aj.load_arm("pandaa"), "'pandaa' is neither a file nor an arm", "did you mean 'panda'?")
     assert_refused(lambda: aj.load_arm("zzz"), "'zzz'", "choose one of cheng2018-ra7125", "ur5e.")
     assert_refused(lambda: aj.load_arm("missing.toml"), "missing.toml does not exist", "check the path")

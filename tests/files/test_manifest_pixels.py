@@ -207,7 +207,8 @@ def test_corners_that_cannot_be_those_of_the_target_are_refused(tmp_path, seen, 
 
 
 @pytest.mark.slow
-def test_columns_named_as_the_joints_of_a_urdf_are_the_readings(tmp_path, seen):
+@pytest.mark.parametrize("end", ["", ".pos"])  # .pos: as LeRobot writes them
+def test_columns_named_as_the_joints_of_a_urdf_are_the_readings(tmp_path, seen, end):
     """In any order, beside other columns of numbers; the arm of this URDF need not fit the images."""
     names = ["pan", "lift", "elbow", "roll", "pitch", "yaw"]
     links = "".join(f'<link name="l{i}"/>' for i in range(7))
@@ -220,7 +221,7 @@ def test_columns_named_as_the_joints_of_a_urdf_are_the_readings(tmp_path, seen):
     files(tmp_path, seen)
     table = (tmp_path / "joints.csv").read_text().splitlines()
     cells = [row.split(",") for row in table[1:]]
-    header = ",".join(["image", "speed", *(f"{name} [deg]" for name in reversed(names))])
+    header = ",".join(["image", "speed", *(f"{name}{end} [deg]" for name in reversed(names))])
     rows = [",".join([image, "7", *reversed(q)]) for image, *q in cells]
     (tmp_path / "joints.csv").write_text("\n".join([header, *rows]) + "\n")
     (tmp_path / "capture.toml").write_text('arm = "robot.urdf"\n' + TARGET + CAMERA + PIXELS)

@@ -55,6 +55,7 @@ class Camera(AbstractDevice):
             if now < self._retry_at:
                 time.sleep(0.02)
                 return []
+            cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # else it reports every attempt
             self._capture = cv2.VideoCapture(int(self._where) if self._where.isdecimal() else self._where)
             self._retry_at = now + RETRY
         if not self._newest(now):
