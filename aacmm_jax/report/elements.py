@@ -105,7 +105,8 @@ class Report(NamedTuple):
         for match in re.finditer("[:;.] ", self.verdict[:_HEADLINE]):
             start, rest = self.verdict[: match.start()], self.verdict[match.end() :]
             if start.count("(") == start.count(")"):
-                return start, rest[:1].upper() + rest[1:] if rest.split()[0].strip(".,;").isalpha() else rest
+                word = rest.split()[0].strip(".,;").replace("-", "").isalpha()  # not a symbol such as "d_5"
+                return start, rest[:1].upper() + rest[1:] if word else rest
         return self.verdict, ""
 
 

@@ -303,7 +303,7 @@ def procedure(summary: dict[str, Any]) -> View:
         name = row["name"] if other is None else bar
         rows.append((row["test"], name, row["group"], at(row["position_mm"]), end, f"{row['poses']}{poses}"))
     headings = ("test", "name", "group", "at (x, y, z) [mm]", "to (x, y, z) [mm]", "poses")
-    yield listed("", rows, headings)
+    yield listed("Positions", rows, headings)
     yield (
         "Checked: joint limits, reach, that no part of the arm is below the table, and that spheres are touched from "
         "outside. Not checked: obstacles, collisions of the arm with itself, and how artefacts are mounted."

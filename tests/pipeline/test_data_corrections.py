@@ -48,6 +48,7 @@ def errors(record, true):
     return [float(np.sqrt(np.mean((values - lengths) ** 2))) for values in measured.values()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "count", "ratio"), [("ur10e", 5, 0.9), ("ur10e", 8, 0.4), ("irb120", 8, 0.4)])
 def test_too_few_points_have_a_prior(name, count, ratio):
     recording, true = recorded(name, count)
@@ -62,6 +63,7 @@ def test_too_few_points_have_a_prior(name, count, ratio):
     assert record.given_noise is not None
 
 
+@pytest.mark.slow
 def test_what_is_stated_stays():
     recording, _ = recorded("ur10e", 8)
     with pytest.raises(aj.InputError, match="equations"):

@@ -88,7 +88,7 @@ def test_shared_geometry_is_left_out_together(paper_arm):
         aj.cross_validate(paper_arm, few, aj.Bounds.around(paper_arm, aj.Parameters.independent(paper_arm)))
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("kind", SIMULATED)
 def test_some_poses_of_an_observation(paper_arm, kind):
     """Residuals of the poses that remain are what they were."""

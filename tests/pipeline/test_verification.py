@@ -31,7 +31,7 @@ def recording(nominal, true, poses=8, lengths=(), sockets="ABC"):
     )
 
 
-@pytest.mark.first_rows(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("true", "other", "verdict"),
     [(1.0, 0.2, "better"), (1.0, 0.0, "better"), (-1.0, 0.0, "worse"), (0.0, 4.0, "worse"), (0.5, 0.8, "equivalent")],
@@ -147,6 +147,7 @@ def test_the_standard_error_is_that_of_leaving_out_each_pose():
     assert found.u == pytest.approx(np.sqrt(11 / 12 * np.sum((np.array(shares) - whole) ** 2)))
 
 
+@pytest.mark.slow
 def test_equally_good_parameters_are_told_apart_as_rarely_as_stated():
     random = np.random.default_rng(1)
     decided = [_paired(*drawn(random, 0.5)).verdict != "not decided" for _ in range(400)]

@@ -183,6 +183,7 @@ def test_placements_are_in_the_region_and_the_range(paper_arm, quick):
     assert all(0 <= fraction <= 1 for _, fraction in reported)
 
 
+@pytest.mark.slow
 def test_placements_keep_off_the_end_of_the_reach(paper_arm):
     """By default off the last 5 %, in whatever ranges are given."""
     reach = aj.kinematics.arm_reach(paper_arm)
@@ -296,6 +297,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.first_rows(5)
 @pytest.mark.parametrize("case", REFUSED)
 def test_refused(paper_arm, quick, case):
     options, text = REFUSED[case]
