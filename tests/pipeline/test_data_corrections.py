@@ -117,6 +117,8 @@ def test_wrong_readings_are_corrected(mistake, says):
     assert record.converged
     assert not record.implausible_residual
     assert says in record.decisions[0]
+    read_as = {exchanged: (1, 3, 2, 4, 5, 6), turned: (1, 2, -3, 4, 5, 6)}.get(mistake, (1, 2, 3, 4, 5, 6))
+    assert record.recording.read_as == read_as
     if mistake is shifted:  # the calibrated arm holds the zero, with the readings as they are
         q = np.asarray(record.recording.capture.observations[0].q)
         assert np.array_equal(q, recording.capture.observations[0].q)
