@@ -74,7 +74,7 @@ test-rounding: .venv/.test
 test-exhaustive: .venv/.test
 	$(BIN)/python $(PYTEST) -m "(exhaustive or slow) and not optimised"
 	$(OPTIMISED) $(BIN)/python $(PYTEST) -m "(exhaustive or slow) and optimised" $(OPTIMISED_FILES)
-	AACMM_EXAMPLES=10 $(OPTIMISED) $(BIN)/python $(PYTEST) -m "hypothesis and not slow"
+	AACMM_EXAMPLES=10 $(OPTIMISED) $(BIN)/python $(PYTEST) -m "hypothesis and not exhaustive"
 
 test-newest: install-newest
 	$(MAKE) --no-print-directory run-newest

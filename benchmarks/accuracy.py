@@ -1,9 +1,10 @@
 """Errors on held-out poses of real robots: this toolkit, figaroh, pybotics and OpenCV on the same poses.
 
-``python benchmarks/accuracy.py [--only points] [--only hand-eye]`` calibrates a UR5 with 800 of 1,000 positions of a
-reflector and predicts the other 200 (``points``), and finds the target on the flange of a UR10 and its base in the
-tracker's frame, by 500 of 2,772 measured poses, with the arm as the maker states it (``hand-eye``). Writes
-``results/accuracy.json``. Peers that are not installed are named as absent; `make peers` installs them.
+``python benchmarks/accuracy.py [--only points] [--only hand-eye] [--rows pybotics]`` calibrates a UR5 with 800 of 1,000
+positions of a reflector and predicts the other 200 (``points``), and finds the target on the flange of a UR10 and its
+base in the tracker's frame, by 500 of 2,772 measured poses, with the arm as the maker states it (``hand-eye``). Writes
+``results/accuracy.json`` after each row; ``--rows`` computes those alone whose name contains a text. Peers that are not
+installed are named as absent; `make peers` installs them.
 """
 
 import argparse
@@ -11,6 +12,8 @@ import json
 import subprocess
 import tempfile
 import time
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +28,7 @@ RESULTS = HERE / "results/accuracy.json"
 POINTS = "examples/ur5/positions.toml --hold-out 0.2 --seed 0"
 HAND_EYE = "examples/ipa_ur10/transforms.toml --only-poses 500 --seed 0"
 Row = dict[str, Any]
+Rows = dict[str, Callable[[], Row]]  # each is computed when it is called
 
 
 def ours(command: str) -> Row:
@@ -60,7 +64,7 @@ def distances(rows: dict[str, np.ndarray] | None, points: np.ndarray) -> Row:
     return row | {"parameters": len(rows["values"]), "cpu_s": float(rows["seconds"])}
 
 
-def points() -> dict[str, Row]:
+def points() -> Rows:
     """Positions of a reflector on a UR5; base frame and reflector are unknown."""
     recording = aj.files.read_manifest(ROOT / "examples/ur5/positions.toml")
     masks = held_out_poses(recording.capture, 0.2, None, 0)
@@ -70,24 +74,24 @@ def points() -> dict[str, Row]:
     arm = recording.nominal.arm
     given = {key: np.asarray(getattr(arm, key)) for key in ("alpha", "a", "d")}
     given |= {"q": q[~out], "points": seen[~out], "q_unseen": q[out], "points_unseen": seen[out]}
-    rows = {
-        "aacmm_jax, D-H": ours(f"aacmm calibrate {POINTS} --model dh"),
-        "aacmm_jax, default": ours(f"aacmm calibrate {POINTS}"),
+    rows: Rows = {
+        "aacmm_jax, D-H": lambda: ours(f"aacmm calibrate {POINTS} --model dh"),
+        "aacmm_jax, default": lambda: ours(f"aacmm calibrate {POINTS}"),
     }
+
+    def by(name: str, script: str, **options: Any) -> Row:
+        return distances(peer(name, script, **given, **options), given["points_unseen"])
+
     for elastic, estimation in ((False, "structural"), (True, "structural"), (False, "map")):
         name = f"figaroh 1.0.2, {estimation}{', elastic joints' if elastic else ''}"
-        rows[name] = distances(
-            peer("figaroh", "solve.py", **given, elastic=elastic, estimation=estimation), given["points_unseen"]
-        )
-        print(name, rows[name], flush=True)
+        rows[name] = partial(by, "figaroh", "solve.py", elastic=elastic, estimation=estimation)
     for parallel in (False, True):
         name = f"pybotics 3.1.2 and SciPy, d_2 and d_3 {'free' if parallel else 'fixed'}"
-        rows[name] = distances(peer("pybotics", "points.py", **given, parallel=parallel), given["points_unseen"])
-        print(name, rows[name], flush=True)
+        rows[name] = partial(by, "pybotics", "points.py", parallel=parallel)
     return rows
 
 
-def hand_eye() -> dict[str, Row]:
+def hand_eye() -> Rows:
     """Poses of a target on a UR10 with the maker's parameters."""
     recording = aj.files.read_manifest(ROOT / "examples/ipa_ur10/transforms.toml")
     (part,) = recording.capture.observations
@@ -96,11 +100,18 @@ def hand_eye() -> dict[str, Row]:
     seen = np.tile(np.eye(4), (len(out), 1, 1))
     seen[:, :3, :3], seen[:, :3, 3] = np.asarray(part.rotations), np.asarray(part.points)
     flange = np.asarray(recording.nominal.arm.replace(probe=np.zeros(3)).pose(part.q))
-    rows = {"aacmm_jax, arm fixed": ours(f"aacmm calibrate {HAND_EYE} --arm-fixed")}
-    found = peer("opencv", "solve.py", flange=flange[~out], seen=seen[~out])
+
+    @cache
+    def found() -> dict[str, np.ndarray] | None:
+        return peer("opencv", "solve.py", flange=flange[~out], seen=seen[~out])
+
+    def by(name: str) -> Row:
+        every = found()
+        return {"absent": True} if every is None else posed(every, name, flange, seen, out)
+
+    rows: Rows = {"aacmm_jax, arm fixed": lambda: ours(f"aacmm calibrate {HAND_EYE} --arm-fixed")}
     for name in ("SHAH", "LI", "TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS"):
-        title = f"OpenCV 4, {name.capitalize()}"
-        rows[title] = {"absent": True} if found is None else posed(found, name, flange, seen, out)
+        rows[f"OpenCV 4, {name.capitalize()}"] = partial(by, name)
     return rows
 
 
@@ -125,13 +136,16 @@ PARTS = {"points": points, "hand-eye": hand_eye}
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", choices=PARTS, action="append", help="parts to run; all by default")
+    parser.add_argument("--rows", default="", help="compute only the rows whose name contains this text")
     given = parser.parse_args()
-    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     for part in given.only or PARTS:
-        results[part] = PARTS[part]()
-        for name, row in results[part].items():
-            print(name, row)
-        RESULTS.write_text(json.dumps(results, indent=1) + "\n")
+        for name, computed in PARTS[part]().items():
+            if given.rows in name:
+                row = computed()
+                print(name, row, flush=True)
+                results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}  # now: others may run beside this
+                results.setdefault(part, {})[name] = row
+                RESULTS.write_text(json.dumps(results, indent=1) + "\n")
 
 
 if __name__ == "__main__":

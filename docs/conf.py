@@ -29,6 +29,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "mathml",
+    "source_links",
     "class_fields",
     "api_pages",
     "signatures",

@@ -1,8 +1,10 @@
 """Strictness for all tests: shapes checked at run time, no silent promotion of rank or dtype; and common fixtures.
 
-`make test-slow` leaves the checks of types, which take a tenth of the time, to the others (AACMM_TYPES=0).
+`make test-slow` leaves the checks of types, which take a tenth of the time, to `make test` and `make test-exhaustive`
+(AACMM_TYPES=0).
 """
 
+import collections
 import contextlib
 import functools
 import gc
@@ -32,6 +34,7 @@ hypothesis.settings.load_profile("tests")
 import aacmm_jax as aj  # noqa: E402 - the hook checks every module imported after it
 from aacmm_jax.cli import main  # noqa: E402
 
+SLOW = [pytest.param(None, id="slow", marks=pytest.mark.slow)]  # params of a fixture: all tests that use it are slow
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
 
@@ -261,9 +264,20 @@ def pytest_xdist_make_scheduler(config, log):
     return ByModule(config, log)
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest deselects by markers
 def pytest_collection_modifyitems(items):
-    """Sort the modules by run time (needs ``--no-loadscope-reorder``); the order within a module is kept."""
+    """Sort the modules by run time (needs ``--no-loadscope-reorder``); the order within a module is kept.
+
+    Rows of a table beyond the number that `first_rows` gives are slow.
+    """
     here, rank = Path(__file__).parent, {name: number for number, name in enumerate(LONGEST)}
+    rows = collections.Counter()
+    for item in items:
+        quick = item.get_closest_marker("first_rows")
+        if quick and not item.get_closest_marker("slow") and not item.get_closest_marker("exhaustive"):
+            rows[item.path, item.originalname] += 1
+            if rows[item.path, item.originalname] > quick.args[0]:
+                item.add_marker(pytest.mark.slow)
 
     def of(item):
         module = item.path.relative_to(here).with_suffix("")

@@ -231,6 +231,7 @@ def test_identification(given, run, arguments, parts):
     assert_refused(lambda: run(given.arm, chosen.pop("capture"), chosen.pop("bounds"), **chosen), *parts)
 
 
+@pytest.mark.first_rows(6)
 @pytest.mark.parametrize(
     ("call", "parts"),
     [
@@ -273,6 +274,7 @@ class Reached(Exception):
     """The solve would begin."""
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("hold", ["longest", None])
 @pytest.mark.parametrize(
     ("sizes", "held"),
@@ -310,6 +312,7 @@ def test_too_few_poses(given, monkeypatch, sizes, held, hold):
         run((sizes[0] + more, *sizes[1:]))
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [

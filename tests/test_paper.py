@@ -18,6 +18,7 @@ def test_default_parameters_are_the_papers(paper_arm):
     assert aj.Parameters.free_of(paper_arm).names == published.ORDER
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "hold"),
     [(1, None), pytest.param(2, "d_3", marks=pytest.mark.slow)]
@@ -37,6 +38,7 @@ def test_noise_free_simulation_from_random_starts(paper_arm, paper_capture, numb
     assert np.max(error[:, ~space.lengths]) <= 1e-11
 
 
+@pytest.mark.slow
 def test_scale_from_the_centre_of_the_second_box(paper_arm, paper_capture):
     """With no length held the least-squares step has no component along the true lengths, so stage 1 ends at the
     projection of the start on them: k = <start, truth> / <truth, truth> over the lengths. That is Table 1's 6.6 mm."""

@@ -37,6 +37,7 @@ def test_it_gives_two_commands_that_make_knows():
     assert [line.split("#")[0].strip() for line in block.splitlines()] == ["make demo", "make test"]
 
 
+@pytest.mark.first_rows(3)
 @pytest.mark.parametrize("target", TARGETS)
 def test_a_shell_can_read_what_make_runs(target):
     line = ["make", "--no-print-directory", "--dry-run", "--always-make", target, "NOTEBOOKS=stored"]

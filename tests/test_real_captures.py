@@ -38,6 +38,7 @@ def left_out(case: Case) -> list[str]:
 
 
 # The default cross-validation takes half a minute.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "cross_validate"),
     [

@@ -9,7 +9,7 @@ from .tables import STYLES, Styled, Table, View, listed, plain
 
 VERDICT_MARKS = {"better": "good", "good": "good", "worse": "bad", "not good": "bad", "equivalent": "neutral"}
 _LITTLE = 0.1  # of the RMS error: a smaller gain of a recalibration is none
-MEANING = (
+_RMS_ERROR = (
     "RMS error: RMS distance of a pose from its socket, point or board position, after the tip of the tool and the "
     "frames and positions that no maker states were fitted; it includes the repeatability."
 )
@@ -29,8 +29,7 @@ def verification_summary(checked: Verification, arm: str, delivered: str, scaled
             ("delivered", checked.delivered, checked.length_errors[1]),
         )
     ]
-    share = {"value": checked.share, "lower": checked.share_lower, "upper": checked.share_upper}
-    ratio = {"lower": checked.ratio_lower, "upper": checked.ratio_upper, "margin": MARGIN}
+    share = [None] * 3 if checked.same else [checked.share, checked.share_lower, checked.share_upper]
     return {
         "kind": "verification",
         "arm": arm,
@@ -38,8 +37,8 @@ def verification_summary(checked: Verification, arm: str, delivered: str, scaled
         "verdict": checked.verdict,
         "says": _verdict(checked),
         "accuracy": [rows[1] | {"parameters": "delivered (nominal)"}] if checked.same else rows,
-        "share": None if checked.same else share,
-        "volume_ratio": None if checked.same else ratio,
+        "share": dict(zip(("value", "lower", "upper"), share, strict=True)),  # of no difference there is none
+        "volume_ratio": {"lower": checked.ratio_lower, "upper": checked.ratio_upper, "margin": MARGIN},
         "probability": checked.probability,
         "poses": checked.poses,
         "equations": checked.equations,
@@ -160,7 +159,7 @@ def accuracy_table(summary: dict[str, Any]) -> Table:
 def counted(summary: dict[str, Any]) -> str:
     """The real share, and how many poses, equations and unknowns there are."""
     share, shared = summary["share"], ""
-    if share is not None:
+    if share["value"] is not None:
         of_share = f"{share['value']:.2f} ({LEVEL_IN_PERCENT}: {share['lower']:.2f} to {share['upper']:.2f})"
         shared = f"Real share of the difference: {of_share}. "
     counts = f"{summary['equations']} equations, {summary['unknowns']} unknowns"
@@ -169,7 +168,7 @@ def counted(summary: dict[str, Any]) -> str:
 
 def meaning(summary: dict[str, Any]) -> str:
     """What the numbers are."""
-    return MEANING if summary["share"] is None else f"{MEANING} {_REAL_SHARE}"
+    return _RMS_ERROR if summary["share"]["value"] is None else f"{_RMS_ERROR} {_REAL_SHARE}"
 
 
 def verification(summary: dict[str, Any]) -> View:

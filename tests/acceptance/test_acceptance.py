@@ -100,6 +100,7 @@ def test_smallest_sphere_by_hand(points, diameter):
     )
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(*[st.integers(-20, 20)] * 3), min_size=2, max_size=8))
 def test_smallest_sphere_holds_all_and_none_smaller_does(points):
     points = np.array(points, dtype=float)
@@ -344,6 +345,7 @@ def test_uncertainties_of_metrics_by_hand():
 # --- An arm of known error ---
 
 
+@pytest.mark.slow
 def test_a_perfect_arm_has_no_error_and_the_full_procedure(recorded):
     tests = run(measured_by(recorded.nominal.arm, recorded))
     assert all(abs(found.value) < 1e-6 for values in values_of(tests).values() for found in values)
@@ -352,6 +354,7 @@ def test_a_perfect_arm_has_no_error_and_the_full_procedure(recorded):
     assert {test.standard for test in tests} <= set(EDITIONS)
 
 
+@pytest.mark.slow
 def test_an_arm_that_is_too_large_measures_everything_too_large(recorded):
     grown = 1.0001
     arm = recorded.nominal.arm
@@ -366,6 +369,7 @@ def test_an_arm_that_is_too_large_measures_everything_too_large(recorded):
             assert found.value == pytest.approx(error, abs=2e-6), (name, found.where)
 
 
+@pytest.mark.slow
 def test_a_probe_that_is_off_scatters_tips_on_a_sphere(cheng):
     recorded = simulate_procedure(plan_procedure(cheng.arm, "asme"), cheng, cheng)
     off = 0.1
@@ -466,6 +470,7 @@ def test_a_limit_without_data_is_refused():
 # --- Files ---
 
 
+@pytest.mark.slow
 def test_readings_taken_by_the_plan_come_back_through_its_manifest(procedure, recorded, cheng, tmp_path):
     """As in a laboratory: plan, record one file per socket and per group of touches, import."""
     (tmp_path / "acceptance.toml").write_text(plan_manifest(procedure, "cheng2018-simulation"))
@@ -555,6 +560,7 @@ def test_wrong_manifests_of_points(tmp_path, change, said):
     assert_refused(lambda: aj.files.read_points(tmp_path / "points.toml"), "points.toml", said)
 
 
+@pytest.mark.slow
 def test_an_evaluation_is_stored_whole(recorded, tmp_path):
     used = frozenset(recorded.capture.names[:1])
     limits = {"E_Uni": Limit(0.1, 4e4), "Deltam": Limit(0.1)}
@@ -586,6 +592,7 @@ def calibrated(cheng):
     return aj.calibration.record_of(result, aj.Recording(seen, cheng)), aj.Recording(capture, cheng)
 
 
+@pytest.mark.slow
 def test_only_held_out_data_are_tested_with_the_uncertainty_that_is_stated(calibrated):
     record, recording = calibrated
     found = values_of(
@@ -597,6 +604,7 @@ def test_only_held_out_data_are_tested_with_the_uncertainty_that_is_stated(calib
     assert found["E_Uni"][0].expanded == pytest.approx(2 * math.hypot(0.002, 0.01))
 
 
+@pytest.mark.slow
 def test_sockets_that_share_poses_with_the_calibration_are_not_new(calibrated):
     record, recording = calibrated
     # C is new, B is known except for two poses.
@@ -610,6 +618,7 @@ def test_sockets_that_share_poses_with_the_calibration_are_not_new(calibrated):
     assert "B (12 of 14 poses)" in " ".join(evaluation.warnings)
 
 
+@pytest.mark.slow
 def test_procedures_are_run_where_they_are_asked_for(calibrated, procedure, recorded):
     """By name, by a limit, or because the capture was made for them: as it says, or as its touched spheres say."""
     record, recording = calibrated
@@ -628,6 +637,7 @@ def test_procedures_are_run_where_they_are_asked_for(calibrated, procedure, reco
     assert_refused(lambda: standards(recording, standards=["din"]), "'din'", "jjf, asme, iso")
 
 
+@pytest.mark.slow
 def test_what_makes_an_evaluation_doubtful_is_said_first(calibrated):
     record, recording = calibrated
     seen = aj.evaluate_capture(record, record.recording, limits={"Deltam": Limit(1.0)})
@@ -658,6 +668,7 @@ def test_an_evaluation_of_points_is_stored_whole(tmp_path):
     assert written["verdict"].startswith("Conforms: all limits given are met")
 
 
+@pytest.mark.slow
 def test_bars_at_hand_are_planned_for(cheng):
     procedure = plan_procedure(cheng.arm, "asme", bars=[1000.0, 500.5])
     assert sorted({value for *_, value in procedure.lengths}) == [500.5, 1000.0]
@@ -668,6 +679,7 @@ def test_bars_at_hand_are_planned_for(cheng):
     assert_refused(lambda: plan_procedure(cheng.arm, "iso", bars=[500.0]), "needs 5")
 
 
+@pytest.mark.slow
 def test_an_arm_that_cannot_take_a_zone_goes_without_it():
     procedure = plan_procedure(aj.load_arm("iiwa14"), "asme")
     assert "0 to 20 %" in procedure.left_out[0]
@@ -676,6 +688,7 @@ def test_an_arm_that_cannot_take_a_zone_goes_without_it():
     assert_refused(lambda: plan_procedure(aj.load_arm("iiwa14"), "vdi"), "choose one of jjf, asme, iso")
 
 
+@pytest.mark.slow
 def test_planned_poses_can_be_taken(cheng, procedure):
     limits = np.array(cheng.arm.limits or [(-math.pi, math.pi)] * 6)
     for item in (*procedure.sockets, *procedure.touches):

@@ -46,6 +46,7 @@ def missing(measured: Measured, title: str) -> tuple[str, ...]:
     return test.missing
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("standard", "titles"), [("iso", ISO), ("asme", ASME), ("jjf", (JJF,))])
 def test_a_complete_procedure_bears_the_standards_name(complete, standard, titles):
     for title in titles:
@@ -254,6 +255,7 @@ BROKEN = [
 ]
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(("standard", "title", "breaks", "words"), BROKEN)
 def test_a_procedure_that_breaks_one_requirement_is_incomplete(complete, standard, title, breaks, words):
     """Every requirement that can be checked has a procedure that breaks it, and that only it speaks of."""
@@ -271,6 +273,7 @@ def test_every_requirement_that_is_checked_has_a_procedure_that_breaks_it():
     assert {one.confidence for test in TESTS for one in test.requirements} <= set(get_args(Confidence))
 
 
+@pytest.mark.slow
 def test_parallel_bars_beside_each_other_and_touches_of_a_cap_are_no_complete_test(complete):
     """105 readings of 35 parallel bars 20 mm apart, and 25 touches around the pole."""
     near = bars(complete["iso"], parallel_and_near, every)
@@ -354,6 +357,7 @@ def test_expansions_that_cannot_be_read_are_refused(text):
     assert_refused(lambda: read_expansions(["arm=1,0,20,0", "arm=1,0,20,0"]), "two expansions")
 
 
+@pytest.mark.slow
 def test_symbols_are_of_complete_tests(complete):
     tests = {test.title: test for test in run(complete["iso"])}
     (length,) = tests["length error"].metrics

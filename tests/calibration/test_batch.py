@@ -31,6 +31,7 @@ def starts(box):
     return lower + (upper - lower) * np.random.default_rng(3).uniform(size=(BATCH, 21))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hold", ["d_3", pytest.param(None, marks=pytest.mark.slow)])
 def test_equals_single_identifications(paper_arm, noisy_capture, box, starts, hold):
     many = aj.identify_many(paper_arm, noisy_capture, *box, starts, hold=hold)
@@ -115,6 +116,7 @@ def test_failure_is_data(paper_arm, noisy_capture, box, starts):
     assert np.all(short.steps == 2)
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -133,6 +135,7 @@ def test_bad_input(paper_arm, noisy_capture, box, starts, change, message):
         aj.identify_many(paper_arm, noisy_capture, **arguments)
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("function", [aj.identify_many, aj.calibrate_many])
 def test_shared_options_are_named(function, paper_arm, noisy_capture, box):
     named = inspect.signature(function).parameters

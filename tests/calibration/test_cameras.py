@@ -44,6 +44,7 @@ def check_geometry(result, expected):
         assert np.abs(ratio).max() < 4.5, part
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("on_arm", [True, False], ids=["on the arm", "fixed"])
 def test_hand_eye_with_an_exact_arm(on_arm):
     eye = seen(on_arm=on_arm, poses=8, u_intrinsics=np.inf)
@@ -154,6 +155,7 @@ def test_residuals_in_pixels_are_those_of_the_corners():
     assert row["rms_px"] == pytest.approx(corners.rms)
 
 
+@pytest.mark.slow
 def test_an_uncertain_scale_of_the_target_is_carried_into_all_lengths():
     exact, uncertain = (
         aj.calibrate(TRUE, aj.simulate(TRUE, {}, observations=[seen(u_scale=u, poses=5)], seed=1), NONE_FREE)
@@ -207,6 +209,7 @@ def long_table(eye):
 TARGET = SimpleNamespace(ids=np.arange(20), points=np.array(BOARD), u_scale=0.0)
 
 
+@pytest.mark.slow
 def test_a_table_of_corners_gives_intrinsics_and_noise():
     """Nothing is stated of the camera: start and standard deviation come from the corners, which are all kept."""
     (eye,) = aj.simulate(TRUE, {}, observations=[seen(poses=12)], seed=1).observations
@@ -219,6 +222,7 @@ def test_a_table_of_corners_gives_intrinsics_and_noise():
     assert made.images[3] == "3.png"
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -237,6 +241,7 @@ def test_bad_tables_of_corners(change, message):
         kinds.pixels_of("eye", eye.q, table, TARGET, camera)
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("fields", "message"),
     [

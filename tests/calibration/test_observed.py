@@ -67,6 +67,7 @@ def u_of(result):
     return np.sqrt(np.diag(result.covariance))
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("kind", "noise"),
     [
@@ -94,6 +95,7 @@ def test_recovers_the_truth(paper_arm, true, space, bounds, kind, noise):
         assert 0 <= min(scatter) <= max(scatter) < 2
 
 
+@pytest.mark.slow
 def test_a_target_and_its_station_are_found(paper_arm, true, bounds):
     """Both frames are unknown: the tracker's, and the reflector's place in the last frame."""
     arm = paper_arm
@@ -136,6 +138,7 @@ def test_a_socket_is_a_socket_however_it_is_written(paper_arm, bounds, sockets):
         assert np.abs((result.parameters - first.parameters) / scale).max() < 1e-9, what
 
 
+@pytest.mark.slow
 def test_estimated_noise_agrees_with_the_eliminated_sockets(paper_arm, bounds, sockets):
     classic = aj.calibrate(paper_arm, sockets, bounds, method="joint")
     others = {name: sockets.sockets[name] for name in ("A", "B")}
@@ -146,6 +149,7 @@ def test_estimated_noise_agrees_with_the_eliminated_sockets(paper_arm, bounds, s
     np.testing.assert_allclose(u_of(explicit), u_of(classic), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_bar_may_have_its_points_on_one_line(paper_arm, true, space, bounds):
     """A ball step turned about its line is the same: what is open there is of no consequence for the arm."""
     step = {name: (x, 0.0, 0.0) for name, x in {"a": 0.0, "b": 120.0, "c": 300.0}.items()}
@@ -159,6 +163,7 @@ def test_a_bar_may_have_its_points_on_one_line(paper_arm, true, space, bounds):
     assert 0.3 < np.mean(normalised**2) < 2.5
 
 
+@pytest.mark.slow
 def test_a_platform_shares_its_frames(paper_arm, true, bounds):
     """One bar in two placements on a platform with three indices has five unknown frames, up to that of the platform
     itself, where six placements alone have six: its uncertainty is smaller."""
@@ -193,6 +198,7 @@ def _composed(outer, inner):
     return (*rotation_vector(first @ rotation_matrix(inner[:3])), *(first @ inner[3:] + outer[3:]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robust", [*(pytest.param(x, marks=pytest.mark.slow) for x in ("huber", "cauchy")), "tukey"])
 def test_a_robust_loss_withstands_bad_poses(paper_arm, true, space, bounds, sockets, robust):
     """One pose in ten is 1 degree off in one joint: least squares is far off, a robust loss is not."""
@@ -208,6 +214,7 @@ def test_a_robust_loss_withstands_bad_poses(paper_arm, true, space, bounds, sock
     assert weights[bad].max() < 0.2 < np.median(weights[~bad])
 
 
+@pytest.mark.slow
 def test_robust_without_outliers_is_nearly_least_squares(paper_arm, bounds, sockets):
     plain = aj.calibrate(paper_arm, sockets, bounds, method="joint", noise=NOISE)
     for robust in ("huber", "tukey"):
@@ -216,6 +223,7 @@ def test_robust_without_outliers_is_nearly_least_squares(paper_arm, bounds, sock
         np.testing.assert_allclose(u_of(result), u_of(plain), rtol=0.25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("robust", "seed"),
     [
@@ -244,6 +252,7 @@ def test_noise_is_estimated_without_its_outliers(paper_arm, true, space, bounds,
     assert 0.3 < np.mean(errors**2) < 2.5
 
 
+@pytest.mark.slow
 def test_sessions_with_a_remounted_probe(paper_arm, true, space, bounds, sockets):
     """Two sessions of one arm, the probe 0.3 mm elsewhere in the second: one probe for both does not fit."""
     remounted = true.replace(probe=np.asarray(true.probe) + np.array([0.3, -0.2, 0.1]))
@@ -259,6 +268,7 @@ def test_sessions_with_a_remounted_probe(paper_arm, true, space, bounds, sockets
     assert float(together.stage1.reduced_chi) > 5
 
 
+@pytest.mark.slow
 def test_stage_1_of_spheres_of_unknown_size_keeps_an_anchor(paper_arm, true, space, bounds):
     simulated = [kinds.SimulatedSphere(f"s{i}", c, 50.0, 25, certified=False) for i, c in enumerate(CENTRES)]
     capture = aj.simulate(true, {}, observations=simulated, noise=NOISE, seed=3)
@@ -272,6 +282,7 @@ def test_stage_1_of_spheres_of_unknown_size_keeps_an_anchor(paper_arm, true, spa
     assert float(found.parameters[anchor]) == float(space.vector()[anchor])
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("observation", "message"),
     [
@@ -326,6 +337,7 @@ def test_what_does_not_know_observations_says_so(paper_arm, bounds, sockets):
             function()
 
 
+@pytest.mark.slow
 def test_known_coordinates_register_the_base(paper_arm, true, bounds):
     """The base in the frame of a plant, with an uncertainty that holds; the plant's coordinates fix the scale."""
     plant = {"a": (0, 0, 0), "b": (400, 0, 0), "c": (0, 400, 50), "d": (300, 300, 200)}
@@ -344,6 +356,7 @@ def test_known_coordinates_register_the_base(paper_arm, true, bounds):
     assert 1e-4 < max(base["position_u_mm"]) < 0.01
 
 
+@pytest.mark.slow
 def test_nothing_but_the_frames_of_a_target_is_free():
     """As by ``calibrate --arm-fixed``: the private and shared geometry is found, and the arm stays as it is."""
     arm = aj.load_arm("ur10")

@@ -130,6 +130,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("what", REFUSED)
 def test_refused_in_one_sentence(paper_arm, what):
     make, message = REFUSED[what]

@@ -33,6 +33,7 @@ def uncertainty_of(arm, noise, of_noise=np.inf):
     return Uncertainty(arm, root @ root.T, none, noise, None, NAMES, of_noise)
 
 
+@pytest.mark.slow
 def test_sums_of_squares_are_those_of_the_whole_covariance(paper_arm, capture):
     """V of all poses of two sockets as one matrix, from which their weighted means are taken."""
     noise = aj.Noise(encoder_arcsec=3, seating=0.01)

@@ -69,6 +69,7 @@ def test_posterior_is_the_product_of_both_gaussians(paper_arm, space, bounds, ca
     )
 
 
+@pytest.mark.slow
 def test_infinite_standard_deviations_are_no_prior(paper_arm, bounds, true):
     points = [kinds.SimulatedPoints("T", BOX, 40, (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0), u=0.01)]
     capture = aj.simulate(true, {}, observations=points, noise=NOISE, seed=3)
@@ -82,6 +83,7 @@ def test_infinite_standard_deviations_are_no_prior(paper_arm, bounds, true):
     np.testing.assert_allclose(u_of(wide), u_of(plain), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_joint_solve_of_sockets_is_met(paper_arm, bounds, capture):
     plain = calibrate(paper_arm, capture, bounds, method="joint")
     wide = calibrate(paper_arm, capture, bounds, prior=aj.Prior({"lengths": 1e5, "angles": 1e3}))
@@ -89,6 +91,7 @@ def test_joint_solve_of_sockets_is_met(paper_arm, bounds, capture):
     assert wide.degrees_of_freedom == pytest.approx(plain.degrees_of_freedom, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_tight_prior_fixes_a_parameter(paper_arm, space, bounds, capture):
     rest = aj.Parameters(paper_arm, tuple(name for name in space.names if not name.startswith("alpha_")))
     fixed = calibrate(paper_arm, capture, aj.Bounds.around(paper_arm, rest), method="joint")
@@ -99,6 +102,7 @@ def test_a_tight_prior_fixes_a_parameter(paper_arm, space, bounds, capture):
     assert tight.prior.effective[0] == pytest.approx(0.0, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_stage_one(paper_arm, space, bounds, capture):
     """The scale anchor stays; without one, the prior of lengths sets the scale."""
     held = aj.identify(paper_arm, capture, bounds, prior=MAKER)
@@ -117,6 +121,7 @@ def test_bounds_still_hold(paper_arm, space, capture):
     assert found.active_names() == {"d_3": "lower"}
 
 
+@pytest.mark.slow
 def test_the_prior_determines_what_too_few_poses_do_not(paper_arm, bounds, true):
     capture = aj.simulate(true, POINTS, poses=4, lengths=[LENGTH], noise=NOISE)
     for options in ({}, {"prior": MAKER}):  # a prior does not say how much tips scatter
@@ -129,6 +134,7 @@ def test_the_prior_determines_what_too_few_poses_do_not(paper_arm, bounds, true)
     assert float(np.sum(found.prior.effective)) < 19  # 25 equations less 6 coordinates of sockets
 
 
+@pytest.mark.slow
 def test_learned_scales(paper_arm, space, bounds):
     """Lengths that err by 0.3 mm, and angles that are right."""
     arm = aj.perturbed_arm(
@@ -169,6 +175,7 @@ def test_learned_scales_settle_where_a_bound_is_reached(name):
     assert calibrate(space.base, capture, aj.Bounds(space, lower, upper), prior=prior).converged
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -183,6 +190,7 @@ def test_refused(paper_arm, bounds, capture, options, message):
         calibrate(paper_arm, capture, bounds, **options)
 
 
+@pytest.mark.slow
 def test_trials_draw_the_means_of_the_prior(paper_arm, space, bounds, capture):
     """About the calibrated parameters, with the prior's standard deviations; other parameters stay."""
     found = calibrate(paper_arm, capture, bounds, prior=aj.Prior({"lengths": 0.3}))
@@ -217,6 +225,7 @@ def test_trials_scatter_as_the_posterior_does(paper_arm, true):
     assert 0.75 < np.median(drawn.u / drawn.linear_u) < 1.25
 
 
+@pytest.mark.slow
 def test_cross_validation_takes_the_prior(paper_arm, bounds, true):
     points = {name: np.add(POINTS["A"], (0, 60 * i, 20 * i)) for i, name in enumerate("ABCD")}
     lengths = [("A", "B", 0.002), ("C", "D", 0.002)]
@@ -227,6 +236,7 @@ def test_cross_validation_takes_the_prior(paper_arm, bounds, true):
     np.testing.assert_allclose([g.length_error[0] for g in found.groups], nominal.error, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_file_and_summary(tmp_path, paper_arm, space, bounds, capture):
     found = calibrate(paper_arm, capture, bounds, prior=aj.Prior({"lengths": 0.3, "d_3": np.inf}, learn=["alpha"]))
     nominal = aj.kinematics.ArmSpecification(paper_arm, "arm", prior=MAKER)

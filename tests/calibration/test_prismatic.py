@@ -38,6 +38,7 @@ def errors_in_u(result, space: aj.Parameters, true: aj.Arm) -> np.ndarray:
     return deviations / np.sqrt(np.diag(np.asarray(result.covariance)))
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("noise", [None, NOISE], ids=["estimated", "given"])
 def test_the_truth_is_recovered_within_its_uncertainty(problem, noise):
     """By the default method, which is the joint solve: slides and lengths fix the scale together.
@@ -64,6 +65,7 @@ def test_what_sets_the_scale(problem):
     assert scale_anchor(space, space.base, "longest").hold == anchor.hold
 
 
+@pytest.mark.slow
 def test_a_linear_axis_that_stands_still_says_nothing():
     space, true, _ = simulated("linear axis")
     rows = {kind: np.asarray(getattr(true, kind))[1:] for kind in ("alpha", "a", "d", "theta", "beta")}
@@ -76,6 +78,7 @@ def test_a_linear_axis_that_stands_still_says_nothing():
         aj.calibrate(space.base, capture, aj.Bounds.around(space.base, space))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gantry", pytest.param("linear axis", marks=pytest.mark.slow)])
 def test_slides_fix_the_scale_without_a_reference_length(name):
     """All lengths come out in the mm of the slides: a reference length of the capture agrees to its uncertainty."""
@@ -90,6 +93,7 @@ def test_slides_fix_the_scale_without_a_reference_length(name):
     np.testing.assert_allclose((stage1.parameters - result.parameters) / space.scale, 0, atol=0.2)
 
 
+@pytest.mark.slow
 def test_two_stages_where_slides_set_the_scale_and_where_not():
     """The lengths then change nothing, which is said; of a SCARA they do, and slides are not divided by k."""
     for name, says in (("linear axis", "readings of joint 1 in mm already set the scale"), ("scara", None)):
@@ -113,6 +117,7 @@ def test_a_batch_equals_single_calibrations():
         np.testing.assert_allclose(found, one.parameters, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_noise_of_linear_encoders():
     """By hand: a slide errs along its axis by its own encoder, or as much as the others do at 1 m."""
     q = np.array([[300.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]])

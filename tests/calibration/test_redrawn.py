@@ -33,6 +33,7 @@ def calibrated(arm, bounds, simulated, sockets=(), lengths=(), **options):
     return capture, aj.calibrate(arm, capture, bounds, noise=NOISE, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind", [pytest.param(kind, marks=() if kind == "spheres" else pytest.mark.slow) for kind in SIMULATED]
 )
@@ -52,6 +53,7 @@ def test_residuals_scatter_as_the_weights_say(paper_arm, bounds, kind):
     assert np.mean(squares) == pytest.approx(1.0, abs=5 * np.sqrt(2 / squares.size))
 
 
+@pytest.mark.slow
 def test_certified_values_are_drawn_once_for_all_that_share_them(paper_arm, bounds):
     capture, result = calibrated(paper_arm, bounds, SIMULATED["bars"])
     batch = truth_of(result, capture).drawn(300, NOISE, np.random.default_rng(0))[0]
@@ -113,6 +115,7 @@ def test_monte_carlo_of_observations(mixed):
     np.testing.assert_allclose(sampled.u, sampled.linear_u, rtol=0.03)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_drawn(paper_arm, bounds, mixed):
     capture, result = mixed
     plate = [SIMULATED["plate"][0].changed(poses=1)]

@@ -130,6 +130,7 @@ def test_cross_validation_of_honest_data(arm, bounds, capture):
     assert 0.2 < checked.length_rms / checked.length_u < 2.2
 
 
+@pytest.mark.slow
 def test_cross_validation_shows_what_the_uncertainty_misses(arm, bounds, capture):
     """Errors that all poses of a placement share, as of an arm that gives way: the lengths come out wrong by far more
     than their u."""
@@ -179,12 +180,14 @@ def test_what_is_surprising(case):
     assert checked.open == (case == "open")
 
 
+@pytest.mark.slow
 def test_one_placement_cannot_be_cross_validated(arm, bounds, capture):
     alone = capture.select(only=["0/*"])
     with pytest.raises(aj.InputError, match="at least two groups of sockets"):
         aj.cross_validate(arm, alone, bounds)
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.filterwarnings("ignore:.* the scale, so the reference lengths have no effect")
 @pytest.mark.parametrize(
     ("options", "text"), [({"digits": 3}, "digits is 3; choose one of 1, 2"), ({"level": 95}, "level is 95")]

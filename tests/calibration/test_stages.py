@@ -84,6 +84,7 @@ def test_a_noisier_instrument_needs_a_longer_fixed_length(paper_arm):
     assert scale_anchor(space, paper_arm, "longest", aj.Noise(encoder_arcsec=60.0)).set_by == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["two-stage", "joint"])
 def test_a_free_partner_moves_in_place_of_a_fixed_length(panda, method):
     """d_7 is fixed and lies along the last axis, like probe_z, which takes up its part of the division by k."""
@@ -139,6 +140,7 @@ def badly_determined(paper_arm, probe_x: float = 0.58, d_3: float = 753.0) -> tu
     return true, nominal, aj.Bounds.around(nominal, aj.Parameters.free_of(nominal), length=15.0)
 
 
+@pytest.mark.slow
 def test_a_fixed_length_that_hardly_sees_the_scale_does_not_anchor_it(paper_arm):
     true, nominal, bounds = badly_determined(paper_arm)
     capture = recorded(true)
@@ -212,6 +214,7 @@ def test_many_equal_single_ones_where_a_fixed_length_has_no_partner(paper_arm, m
     assert many.stage1.sigma[0] == pytest.approx(float(one.stage1.after.sigma), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_bound_on_the_scale_anchor(too_long, capture, cut):
     """d_3 cannot reach the value that the reference length asks for, and ends on its bound."""
     j = cut.space.index("d_3")
@@ -234,6 +237,7 @@ def tight(paper_arm, width: float, **nominal: float) -> tuple[aj.Arm, aj.Bounds]
     return arm, aj.Bounds.around(arm, space, length=15.0, override=dict.fromkeys(others, width))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("d_3", "width"),
     [
@@ -258,6 +262,7 @@ def test_the_start_does_not_matter_however_much_bounds_act_from_it(paper_arm, ca
     np.testing.assert_allclose(many.parameters[0], result.parameters, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_covariance_depends_on_the_solution_and_not_on_the_start(paper_arm, capture):
     """A bound that only the scaled arm is on: stage 1 leaves small residuals from one start, and large ones from the
     other."""
@@ -272,6 +277,7 @@ def test_covariance_depends_on_the_solution_and_not_on_the_start(paper_arm, capt
     np.testing.assert_allclose(u[0], u[1], rtol=1e-2, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_many_start_inside_their_boxes(too_long, capture, cut):
     """The scale anchor too, which no step of stage 1 would bring back inside."""
     start = np.array(cut.space.vector(too_long))
@@ -303,6 +309,7 @@ def test_covariance_on_a_bound_is_what_trials_show(too_long, paper_arm, capture,
     assert np.all((ratio > 0.85) & (ratio < 1.15)), ratio.round(2)
 
 
+@pytest.mark.slow
 def test_fixed_values_come_from_the_arm_and_not_from_the_space(paper_arm, capture):
     """A space that frees beta has an arm of its own; the arm given has other fixed values and no beta at all."""
     other = with_values(paper_arm, probe_x=5.0, a_6=3.0)
@@ -331,6 +338,7 @@ BATCHES = {
 }
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("what", BATCHES)
 @pytest.mark.parametrize("function", ["identify", "calibrate"])
 def test_a_batch_is_refused_in_one_sentence(paper_arm, capture, cut, what, function):
@@ -340,6 +348,7 @@ def test_a_batch_is_refused_in_one_sentence(paper_arm, capture, cut, what, funct
     assert str(refused.value).count(".") == 1
 
 
+@pytest.mark.slow
 def test_a_batch_of_arms_is_evaluated_arm_by_arm(paper_arm, too_long, capture):
     both = jax.tree.map(lambda *leaves: jnp.stack(leaves), paper_arm, too_long)
     found = aj.evaluate(both, capture)
@@ -350,6 +359,7 @@ def test_a_batch_of_arms_is_evaluated_arm_by_arm(paper_arm, too_long, capture):
     np.testing.assert_allclose(aj.evaluate(shared, capture).repeatability.de, found.repeatability.de, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_residual_that_no_arm_has_is_not_plausible(paper_arm, capture, cut):
     """Two joints exchanged: the solve ends at a minimum, of 10 cm."""
     bounds = aj.Bounds.around(paper_arm, cut.space)
@@ -368,6 +378,7 @@ def test_a_residual_that_no_arm_has_is_not_plausible(paper_arm, capture, cut):
     assert "the data do not match the arm" not in " ".join(said[0])
 
 
+@pytest.mark.slow
 def test_results_of_one_and_of_many_have_the_same_fields(paper_arm, capture, cut):
     bounds = aj.Bounds.around(paper_arm, cut.space)
     one = aj.calibrate(paper_arm, capture, bounds)
@@ -402,6 +413,7 @@ def test_coverage_of_a_shipped_arm_with_a_fixed_length_along_the_probe():
     assert found["active"] == 0
 
 
+@pytest.mark.slow
 def test_sensitivities_are_those_of_the_divided_parameters(paper_arm, monkeypatch):
     """By differences, of an arm that stage 1 makes 5 % too large; a displacement of the tip is in mm of the result."""
     kept = []

@@ -21,6 +21,7 @@ def errors(detection, target, true):
     return detection.corners - true[order[np.searchsorted(target.ids[order], detection.ids)]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 12), marks=pytest.mark.slow)], ids=["2", "10"])
 @pytest.mark.parametrize("name", TARGETS)
 def test_corners_are_found_without_bias_and_in_their_order(name, seeds):
@@ -34,6 +35,7 @@ def test_corners_are_found_without_bias_and_in_their_order(name, seeds):
     assert np.sqrt(np.mean(found**2)) < 0.12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["checkerboard", "charuco", "april"])
 def test_a_fisheye_camera_bends_boards_without_making_them_others(name):
     target = TARGETS[name]
@@ -43,6 +45,7 @@ def test_a_fisheye_camera_bends_boards_without_making_them_others(name):
     assert np.abs(found).max() < 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_corners_that_a_wide_lens_bends_by_many_pixels_are_those_of_the_target(seed):
     """A corner that is taken for its neighbour is not."""
@@ -89,6 +92,7 @@ REFUSED = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", REFUSED)
 def test_an_image_that_would_be_misread_is_refused(case):
     target, image, reason = REFUSED[case]
@@ -97,12 +101,14 @@ def test_an_image_that_would_be_misread_is_refused(case):
     assert len(detection.ids) == len(detection.corners) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("columns", [9, 10])
 @pytest.mark.parametrize("seed", range(2))
 def test_a_larger_checkerboard_is_never_taken_for_the_stated_one(columns, seed):
     assert detect(scene(Checkerboard(columns, 15 - columns, 22.0), seed)[0], CHECKERS).refused
 
 
+@pytest.mark.slow
 def test_hidden_corners_are_absent_and_the_others_are_right():
     image, true = scene(CHARUCO, 1)
     x, y = true[8].astype(int)
@@ -113,6 +119,7 @@ def test_hidden_corners_are_absent_and_the_others_are_right():
     assert np.abs(errors(detection, CHARUCO, true)).max() < 0.5
 
 
+@pytest.mark.slow
 def test_a_marker_of_another_target_is_said_and_not_used():
     image, true = scene(TAGS, 1)
     image[380:480, :100] = 255
@@ -123,6 +130,7 @@ def test_a_marker_of_another_target_is_said_and_not_used():
     assert np.abs(errors(detection, TAGS, true)).max() < 0.6
 
 
+@pytest.mark.slow
 def test_a_file_is_read_as_the_sensor_took_it_and_another_size_is_refused(tmp_path):
     image, _ = scene(CHARUCO)
     path = tmp_path / "image.png"
@@ -133,6 +141,7 @@ def test_a_file_is_read_as_the_sensor_took_it_and_another_size_is_refused(tmp_pa
     assert refused == "it has 640 x 480 px, but the intrinsics of the camera are for 1280 x 720 px"
 
 
+@pytest.mark.slow
 def test_a_picture_shows_corners_and_reasons():
     image, _ = scene(CHARUCO)
     pictures = [

@@ -14,6 +14,7 @@ from ..conftest import EXAMPLES
 FOLDER = EXAMPLES / "webcam"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 9, 18])
 def test_the_true_arm_and_camera_see_the_corners_that_are_detected(number):
     """Within the noise of the readings, 0.05 deg a joint, which is some px."""

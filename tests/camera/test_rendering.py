@@ -1,6 +1,7 @@
 """Rendered images: black and white where the target is, the same for the same seed, and wrong cameras."""
 
 import numpy as np
+import pytest
 
 from aacmm_jax.camera.rendering import Optics, render
 from aacmm_jax.data.targets import Checkerboard
@@ -20,6 +21,7 @@ def test_squares_are_black_and_white_around_their_corners():
     assert levels[black].max() < 60 < 120 < levels[~black].min()
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_image_and_a_scale_moves_corners():
     image, corners = scene(BOARD, 2)
     again, _ = scene(BOARD, 2)

@@ -48,6 +48,7 @@ def contents(text: str, path: str) -> list[str]:
 # against PTB's Schematron rules, and by the properties tested further down.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_content_model_holds(certificates, kind):
     assert dcc_model.faults(certificates[kind]) == []
@@ -66,6 +67,7 @@ WRONG = [
 ]
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(("old", "new"), WRONG)
 def test_the_content_model_notices_what_is_wrong(certificates, old, new):
     good = certificates["all stated"]
@@ -94,6 +96,7 @@ def test_the_published_schema_notices_what_is_wrong(schema, certificates, old, n
     assert schema.validate_dcc(good.replace(old, new)) != []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_published_schematron_rules_hold(certificates, kind):
     from dcclib import validation
@@ -115,6 +118,7 @@ def test_the_published_schematron_rules_hold(certificates, kind):
 # What holds without either
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_elements_are_in_the_order_of_the_schema(certificates, kind):
     root = ElementTree.fromstring(certificates[kind].encode())
@@ -128,14 +132,17 @@ def test_elements_are_in_the_order_of_the_schema(certificates, kind):
     assert [children(result) for result in root[1]][:2] == [parts.split()] * 2
     core = root[0].find(f"{DCC}coreData")
     dates = "beginPerformanceDate endPerformanceDate performanceLocation"
-    given = f"receiptDate {dates} issueDate" if kind in ("all stated", "hostile names") else dates
+    given = (
+        f"receiptDate {dates} issueDate reportAmendedSubstituted" if kind in ("all stated", "hostile names") else dates
+    )
     languages = "usedLangCodeISO639_1 mandatoryLangCodeISO639_1"
     assert core is not None
     assert children(core) == f"countryCodeISO3166_1 {languages} uniqueIdentifier {given}".split()
     found, left = (contents(certificates[kind], f"*/dcc:measurementResult[{n}]/dcc:results/*/dcc:name") for n in (1, 2))
     observations = kind == "observations"
     assert found == ["Repeatability", "Observations" if observations else "Reference lengths", PARAMETERS]
-    assert left == [*found, "Covariance matrix", *([] if observations else ["Scale"])]
+    later = ["Expanded uncertainty", "Covariance matrix", *([] if observations else ["Scale"])]
+    assert left == [*found, *later]
 
 
 def two_digits(found, value: float, expanded: float) -> None:
@@ -187,10 +194,12 @@ def test_numbers_read_back(record):
     assert [element.text for element in stated] == ["0.01"] * 2  # that of the first; the second is exact
     k = values["Calibrated parameters", "Scale", "k"]
     two_digits(k, record.k, uncertainty.expanded_k())
-    # Three metrics, three numbers for each of two lengths, and 27 parameters, twice; and the scale.
-    assert len(values) == 2 * (3 + 6 + 27) + 1
+    # Three metrics, three numbers for each of two lengths, and 27 parameters, twice; the scale; a length, and
+    # three statistics of tips and of such lengths, in both regions.
+    assert len(values) == 2 * (3 + 6 + 27) + 1 + 2 * 2 * 4
 
 
+@pytest.mark.slow
 def test_the_covariance_matrix_is_a_table(record, certificates):
     """A row a parameter, with the units of the products; enough digits to be symmetric and positive definite."""
     root = ElementTree.fromstring(certificates["nothing stated"])
@@ -216,6 +225,7 @@ def contents_of(element, tag: str) -> list[str]:
 # Acceptance tests and conformity
 
 
+@pytest.mark.slow
 def test_acceptance_results_have_their_conformity_beside_them(evaluation, certificates):
     values = parse_dcc(certificates["all stated"])
     for stage, name in (("nominal", "nominal parameters"), ("calibrated", "calibrated parameters")):
@@ -255,6 +265,7 @@ def test_decisions_in_the_words_of_the_certificate(value, decision, word):
     assert _conformity(MetricValue("x", value, 0.01, None, 0.05, decision)) == word
 
 
+@pytest.mark.slow
 def test_a_conformity_rests_on_results(record, full, evaluation):
     def certificate(tested, verdict):
         stated = full.model_copy(update={"conformity": full.conformity.model_copy(update={"verdict": verdict})})
@@ -283,6 +294,7 @@ def test_values_are_rounded_to_two_digits_of_their_uncertainty(value, u):
     assert abs(float(one.findtext("value") or "nan") - value) <= 0.0501 * 2 * u * 1.06 + 1e-12
 
 
+@pytest.mark.slow
 def test_observations_are_stated_with_what_is_certified_of_them(observed_record, certificates):
     """The values of the artefacts' own certificates: not the distances of the tip's centre."""
     text = certificates["observations"]
@@ -315,6 +327,41 @@ def test_observations_are_stated_with_what_is_certified_of_them(observed_record,
     assert "robust loss 'tukey'" in text
 
 
+def test_the_target_of_a_camera_has_its_size_and_the_u_of_its_scale():
+    corners = [[[100, 100], [200, 100], [100, 200], [200, 200]]]
+    points = [[[0, 0, 0], [30, 0, 0], [0, 40, 0], [30, 40, 0]]]
+    named = (0.3, "webcam", "board")
+    seen = aj.data.observations.Pixels(
+        "eye", [[0.1]], corners, points, [[0, 1, 2, 3]], *named, intrinsics=(600, 600, 320, 240), u_scale=1e-3
+    )
+    size = measurement_results._size(seen)
+    assert (size.values.tolist(), size.unit, size.u) == ([50.0], "mm", 0.05)
+
+
+@pytest.mark.slow
+def test_uncertainties_of_tips_and_lengths_are_those_over_the_working_volume(record, certificates):
+    values, volume = parse_dcc(certificates["nothing stated"]), aj.volumetric_uncertainty(aj.uncertainty_of(record))
+    for name, key in (("Tip position", "tip"), ("Measured length", "length_reading")):
+        stated = ("Calibrated parameters", "Expanded uncertainty", f"{name}, over all joint limits")
+        assert values[*stated, "length"].value == volume.length
+        for statistic, words in (("median", "median"), ("95", "95th percentile"), ("largest", "largest")):
+            expected = volume.summary[f"expanded_{key}_{statistic}_mm"]
+            assert values[*stated, words][:2] == (pytest.approx(expected, rel=0.05), MM)  # of two digits
+
+
+@pytest.mark.slow
+def test_held_out_poses_have_their_errors(record):
+    rows = aj.residuals_of(record).select(range(5))
+    values = parse_dcc(
+        dcc_xml(record._replace(held_out=rows._replace(use=("held out",) * 5)), AdministrativeData(), created=CREATED)
+    )
+    stated = ("Calibrated parameters", "Held-out poses")
+    assert values[*stated, "poses"].value == 5
+    assert values[*stated, "RMS distance"].value == pytest.approx(np.sqrt(np.mean(rows.distance**2)), abs=5.1e-6)
+    assert values[*stated, "largest distance"].value == pytest.approx(rows.distance.max(), abs=5.1e-6)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [5e-324, -0.0, 1e-5, 0.1, 1 / 3, -123456789.125, 1e99])
 def test_any_number_reads_back(record, value):
     text = dcc_xml(record, AdministrativeData(), created=CREATED)
@@ -329,6 +376,7 @@ def test_any_number_reads_back(record, value):
     assert (read, math.copysign(1, read)) == (value, math.copysign(1, value))
 
 
+@pytest.mark.slow
 def test_parameters_without_an_uncertainty_of_their_own_say_why(record, certificates):
     text = certificates["on bounds"]
     values = parse_dcc(text)
@@ -358,6 +406,7 @@ def test_parameters_without_an_uncertainty_of_their_own_say_why(record, certific
     assert all(left[name] is None and values["Calibrated parameters", PARAMETERS, name].expanded for name in others)
 
 
+@pytest.mark.slow
 def test_priors_and_joint_corrections_are_stated(record):
     """What was assumed is part of the statement on uncertainty, coefficients have their own units."""
     capture = record.recording.capture
@@ -376,6 +425,7 @@ def test_priors_and_joint_corrections_are_stated(record):
     assert "Each joint correction adds its coefficient" in text
 
 
+@pytest.mark.slow
 def test_a_fixed_length_says_so(record):
     i = record.names.index("probe_z")
     parts = ("lower", "upper", "active_stage1", "active", "determined")
@@ -392,6 +442,7 @@ def test_a_fixed_length_says_so(record):
     assert parse_dcc(text)["Calibrated parameters", PARAMETERS, "probe_z"].expanded is None
 
 
+@pytest.mark.slow
 def test_what_is_stated_is_in_the_certificate(certificates, full):
     text = certificates["all stated"]
     root = ElementTree.fromstring(text.encode())
@@ -405,6 +456,8 @@ def test_what_is_stated_is_in_the_certificate(certificates, full):
         ("coreData", "issueDate"): "2026-02-04",
         ("coreData", "performanceLocation"): "laboratory",
         ("items", "item", "name", "content"): 'arm "7"',
+        ("coreData", "reportAmendedSubstituted", "replacedUniqueIdentifier"): "2025-9",
+        ("items", "item", "description", "content"): "worn & dry",
         ("items", "item", "manufacturer", "name", "content"): "maker",
         ("items", "item", "model"): "X'1",
         ("items", "item", "identifications", "identification", "value"): "0007",
@@ -436,6 +489,7 @@ def test_what_is_stated_is_in_the_certificate(certificates, full):
     ]
 
 
+@pytest.mark.slow
 def test_nothing_is_made_up(record):
     text = dcc_xml(record, AdministrativeData(), created=CREATED)
     root = ElementTree.fromstring(text)
@@ -456,6 +510,7 @@ def test_nothing_is_made_up(record):
     assert names[:2] == ["Scale", "Uncertainty"]
 
 
+@pytest.mark.slow
 def test_what_was_left_out_is_stated(record):
     removed = Removed("station", "T2", ("T2/day", "T2/night"), 45.6, (6, 60), 1e-9, 0.2, 0.1, "theta_3", 12.0)
     text = dcc_xml(record._replace(removed=(removed,)), AdministrativeData(), created=CREATED)
@@ -470,6 +525,7 @@ def test_what_was_left_out_is_stated(record):
     assert_refused(lambda: dcc_xml(hostile, AdministrativeData(), created=CREATED), r"A\x1b", "U+001B")
 
 
+@pytest.mark.slow
 def test_warnings_and_simulations_are_stated(record):
     recording = record.recording
     given = aj.Noise(encoder_arcsec=2.0 / 3, seating=0.005 / 3)
@@ -483,6 +539,7 @@ def test_warnings_and_simulations_are_stated(record):
     assert "The readings are simulated, so this is not a certificate of a real arm." in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stated", "begin", "end"),
     [
@@ -500,6 +557,7 @@ def test_the_day_of_the_calibration_stands_in_for_missing_dates(record, stated, 
     assert f"<dcc:endPerformanceDate>{end}<" in text
 
 
+@pytest.mark.slow
 def test_the_same_calibration_has_the_same_certificate(record):
     one, again = (dcc_xml(record, AdministrativeData(), created=CREATED) for _ in range(2))
     assert one == again
@@ -511,6 +569,7 @@ def test_the_same_calibration_has_the_same_certificate(record):
     assert identifier(one) != identifier(other)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HOSTILE)
 def test_hostile_names_stay_text(record, name):
     record = renamed_sockets(record, name, "B", "C")
@@ -549,6 +608,7 @@ def test_any_text_survives_or_is_refused(text):
 # Refusals
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("changes", "keywords", "parts"),
     [
@@ -570,6 +630,7 @@ def test_what_cannot_be_certified_is_refused(record, changes, keywords, parts):
     )
 
 
+@pytest.mark.slow
 def test_names_that_xml_cannot_hold_are_refused(record):
     assert_refused(
         lambda: dcc_xml(renamed_sockets(record, "A\x1b", "B", "C"), AdministrativeData(), created=CREATED),
@@ -581,6 +642,7 @@ def test_names_that_xml_cannot_hold_are_refused(record):
     assert_refused(lambda: dcc_xml(broken, AdministrativeData(), created=CREATED), r"'\ud800' in", "U+D800")
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("stated", "part"),
     [({"received": "2026-03-06"}, "certificate.received"), ({"issued": "2026-03-04"}, "certificate.issued")],
@@ -652,6 +714,7 @@ def test_what_is_no_certificate_is_refused(text, parts):
     assert_refused(lambda: parse_dcc(text), *parts)
 
 
+@pytest.mark.slow
 def test_a_certificate_whose_number_was_edited_is_refused(record):
     text = dcc_xml(record, AdministrativeData(), created=CREATED)
     k = f"<si:value>{parse_dcc(text)['Calibrated parameters', 'Scale', 'k'].value!r}</si:value>"

@@ -28,6 +28,7 @@ def write(path, header, rows):
     path.write_text("\n".join([",".join(header)] * bool(header) + [",".join(map(str, row)) for row in rows]) + "\n")
 
 
+@pytest.mark.slow
 def test_a_template_is_written_looked_at_and_not_overwritten(aacmm, tmp_path, monkeypatch):
     monkeypatch.setattr(first_capture, "_PLACEMENTS", 1)
     assert "Written: my.toml" in aacmm("arm", "--new", "my.toml", "--joints", 4).stdout
@@ -66,11 +67,13 @@ def test_a_urdf_in_its_base_link(aacmm, monkeypatch):
     }
 
 
+@pytest.mark.slow
 def test_an_arm_of_which_nothing_can_be_said(aacmm):
     aacmm("arm", "--new", "my.toml", "--joints", 1)
     assert "cannot be computed for this arm" in aacmm("arm", "my.toml").stdout
 
 
+@pytest.mark.slow
 def test_a_table_of_known_positions(aacmm, tmp_path, few):
     arm = aj.load_arm("cheng2018-simulation")
     columns = (Q * [1, 1, -1, 1, 1, 1])[:, [0, 1, 2, 4, 3, 5]]
@@ -82,6 +85,7 @@ def test_a_table_of_known_positions(aacmm, tmp_path, few):
     assert angles == {"unit": "deg", "columns": [1, 2, 3, 5, 4, 6], "sign": [1, 1, -1, 1, 1, 1]}
 
 
+@pytest.mark.slow
 def test_positions_in_metres_are_no_matter_of_the_angles(aacmm, tmp_path, few, monkeypatch):
     """The line that is missing is printed, not the table [angles], which is right; px_m in a table is read as m."""
     monkeypatch.setattr(reading_search, "_MOST", 1000)
@@ -100,6 +104,7 @@ def test_positions_in_metres_are_no_matter_of_the_angles(aacmm, tmp_path, few, m
     )
 
 
+@pytest.mark.slow
 def test_poses_of_a_urdf_are_in_its_base_link(aacmm, tmp_path, few):
     chain = aj.files.urdf_chain(aj.files.load_specification(URDF, base="shoulder", tip="tool0").urdf)
     q = Q[:, : chain.arm.joints]
@@ -111,6 +116,7 @@ def test_poses_of_a_urdf_are_in_its_base_link(aacmm, tmp_path, few):
     assert found["given"]["rms_mm"] < 1e-6
 
 
+@pytest.mark.slow
 def test_what_is_found_corrects_the_manifest(aacmm, tmp_path, few):
     """Columns, signs and offsets that the manifest states already are taken into account."""
     capture = aj.simulate(aj.load_arm("cheng2018-simulation"), {"A": (400, 200, 300), "B": (600, 0, 400)}, poses=15)
@@ -160,12 +166,14 @@ def test_the_printed_table_passes_the_check(aacmm, tmp_path, few, header, size, 
     assert np.all(np.abs(turns) <= 0.5 + 1e-6)
 
 
+@pytest.mark.slow
 def test_readings_that_nothing_explains(aacmm, tmp_path, few):
     write(tmp_path / "poses.csv", [], np.random.default_rng(0).uniform(-3, 3, (30, 6)))
     said = aacmm("arm", "cheng2018-simulation", "--check", "poses.csv", expect=1)
     assert said.stdout.startswith("No permutation, sign or zero offset of the columns explains these readings")
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
@@ -192,11 +200,13 @@ def test_a_model_of_which_nothing_is_left_out():
     assert arm_survey._left_out(with_corrections(aj.load_arm("panda"), "gear"), "gear") == []
 
 
+@pytest.mark.slow
 def test_a_capture_of_another_number_of_joints(aacmm, mukca):
     said = aacmm("arm", "cheng2018-simulation", "--check", mukca / "panda_3.toml", expect=2).stderr
     assert "7 joints" in said
 
 
+@pytest.mark.slow
 def test_import_checks_the_readings(aacmm, tmp_path, few, paper_arm, paper_capture):
     """Joint 5 moves by 0.1 deg; commanded readings differ from measured ones. Nothing is written without -o."""
     q = np.array(paper_capture.q)[:60]

@@ -67,6 +67,7 @@ def frames(aacmm, folder, *options):
     return frame, written["joint-origin"], (x["child-frame-id"], x["frame-id"])
 
 
+@pytest.mark.slow
 def test_the_exported_robot_and_camera_see_the_corners(aacmm, calibrated, tmp_path):
     folder, links, seen = calibrated
     _, joint, named = frames(aacmm, folder)
@@ -85,6 +86,7 @@ def test_the_exported_robot_and_camera_see_the_corners(aacmm, calibrated, tmp_pa
         np.testing.assert_allclose(corners.T, np.asarray(seen.corners)[pose], atol=0.02)
 
 
+@pytest.mark.slow
 def test_what_is_printed_is_what_is_exported(aacmm, calibrated):
     folder, links, _ = calibrated
     [row] = json.loads(aacmm("show", folder / "c.h5", "--json").stdout)["cameras"]

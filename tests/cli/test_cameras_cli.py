@@ -70,6 +70,7 @@ def test_what_a_camera_cannot_separate_is_said(aacmm, folder):
         assert ("No observation shows the tip." in shown) is said
 
 
+@pytest.mark.slow
 def test_nothing_but_the_arm_is_refused(aacmm, folder):
     said = aacmm("calibrate", folder / "on-arm.h5", "-o", "c.h5", "--arm-fixed", "--free", "beta_2", expect=2).stderr
     assert "--arm-fixed" in said
@@ -118,6 +119,7 @@ def test_rendered_images_are_read_as_they_were_simulated(aacmm, tmp_path):
     assert np.abs(apart).max() < 0.6
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("kit", "options", "says"),
     [

@@ -33,6 +33,7 @@ SIMULATE = (
 )
 
 
+@pytest.mark.first_rows(3)
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_has_an_example(aacmm, command):
     text = aacmm(command, "--help").stdout
@@ -54,6 +55,7 @@ def test_demo_recovers_the_truth_and_leaves_its_files(aacmm, tmp_path):
     np.testing.assert_allclose(calibrated.a, true.a, atol=0.1)
 
 
+@pytest.mark.slow
 def test_whole_path(aacmm, tmp_path):
     summary = json.loads(aacmm(*SIMULATE, "--json").stdout)
     assert summary["poses"] == 78
@@ -95,6 +97,7 @@ def test_whole_path(aacmm, tmp_path):
         assert aacmm("show", file).stdout
 
 
+@pytest.mark.slow
 def test_not_converged_is_exit_code_1_and_still_written(aacmm, tmp_path, monkeypatch):
     """A solve that is stopped by its step limit has not converged."""
     aacmm(*SIMULATE)
@@ -105,6 +108,7 @@ def test_not_converged_is_exit_code_1_and_still_written(aacmm, tmp_path, monkeyp
     assert (tmp_path / "calibration.h5").exists()
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -144,6 +148,7 @@ def test_debug_shows_the_traceback(aacmm_process):
     assert "Traceback" in aacmm_process("calibrate", "none.h5", "-o", "x.h5", "--debug", expect=1).stderr
 
 
+@pytest.mark.slow
 def test_float32_is_refused_at_import(aacmm_process, monkeypatch, tmp_path):
     monkeypatch.setenv("JAX_ENABLE_X64", "0")
     script = tmp_path / "aacmm"  # as pip writes the console script
@@ -166,6 +171,7 @@ def test_a_process_of_its_own(aacmm_process, cache, tmp_path, monkeypatch):
     assert "No such command" in aacmm_process("frobnicate", expect=2).stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "redirection", "encoding", "code", "error"),
     [
@@ -259,6 +265,7 @@ def test_uncertainties_are_printed(aacmm):
     assert "Observability: rank 21 of 21" in shown
 
 
+@pytest.mark.slow
 def test_what_cannot_be_determined_is_a_warning_or_with_strict_an_error(aacmm):
     aacmm(*SIMULATE)
     free = ("calibrate", "capture.h5", "-o", "c.h5", "--free", "alpha_6")
@@ -269,6 +276,7 @@ def test_what_cannot_be_determined_is_a_warning_or_with_strict_an_error(aacmm):
     assert one.stderr.startswith("Error: --seating-mm is missing")
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
@@ -297,6 +305,7 @@ def panda_files(tmp_path_factory):
     return folder
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("option", [("--rule", "simple"), ("--test-u-mm", "0.001"), ("--range-mm", "800")])
 def test_options_without_an_acceptance_test_are_refused(aacmm, panda_files, tmp_path, option):
     shutil.copytree(panda_files, tmp_path, dirs_exist_ok=True)
@@ -306,6 +315,7 @@ def test_options_without_an_acceptance_test_are_refused(aacmm, panda_files, tmp_
     assert not (tmp_path / "e.h5").exists()
 
 
+@pytest.mark.slow
 def test_the_stored_summary_is_what_is_computed(aacmm, panda_files, tmp_path):
     """``show`` prints the summary in the file; without one, or with that of another version, it computes the same."""
     shutil.copytree(panda_files, tmp_path, dirs_exist_ok=True)
@@ -333,6 +343,7 @@ _PLOTS = "matplotlib jinja2"
 _NEVER_NEEDED = "optimistix lineax jax.experimental.pallas xarray matplotlib"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "absent"),
     [
@@ -361,6 +372,7 @@ def test_a_command_imports_and_compiles_no_more_than_it_needs(panda_files, tmp_p
     assert set(absent.split()) & set(imported.split()) == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mistake", "cause"),
     [

@@ -69,6 +69,7 @@ def test_readings_in_the_columns_and_unit_of_the_table(arms):
     assert (largest["row"] - 1, largest["joint"] - 1) == np.unravel_index(change.argmax(), change.shape)
 
 
+@pytest.mark.slow
 def test_a_table_without_header_and_a_tool_of_both_arms(arms):
     folder, nominal, calibrated = arms
     write(folder / "plain.csv", [], Q)
@@ -79,6 +80,7 @@ def test_a_table_without_header_and_a_tool_of_both_arms(arms):
     np.testing.assert_allclose(tool[0], tool[1], rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("orientation", ["quaternion", "rotation vector"])
 def test_positions_with_orientations(arms, orientation):
     folder, _, calibrated = arms
@@ -96,6 +98,7 @@ def test_positions_with_orientations(arms, orientation):
     np.testing.assert_allclose(q, Q[:1] + 0.02 * np.arange(3)[:, None], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", ["readings", "poses", "points"])
 def test_poses_for_a_controller_that_takes_nothing_else(arms, given):
     """The controller finds readings with the nominal arm; with them, the calibrated arm is where it was wanted."""
@@ -132,6 +135,7 @@ def test_poses_for_a_controller_that_takes_nothing_else(arms, given):
     np.testing.assert_allclose(reached[:, :3, :3], wanted[:, :3, :3], rtol=0, atol=angle)
 
 
+@pytest.mark.slow
 def test_what_is_not_reached_is_named_by_row_and_left_empty(arms):
     folder, _, calibrated = arms
     poses = np.asarray(calibrated.pose(Q[:3])).copy()
@@ -149,6 +153,7 @@ def test_what_is_not_reached_is_named_by_row_and_left_empty(arms):
     assert found["not_reached"][0]["distance_mm"] > 100
 
 
+@pytest.mark.slow
 def test_columns_of_other_names_and_positions_in_metres(arms):
     folder, nominal, _ = arms
     names = ["base", "shoulder", "elbow", "roll", "pitch", "yaw"]
@@ -195,6 +200,7 @@ def test_poses_of_a_urdf_are_in_its_base_link():
     np.testing.assert_allclose(in_first_frame(record, in_base_link), specification.arm.pose(q), rtol=0, atol=1e-9)
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("header", "row", "options", "part"),
     [

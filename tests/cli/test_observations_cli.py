@@ -52,6 +52,7 @@ def folder(tmp_path_factory, paper_arm):
     return folder
 
 
+@pytest.mark.slow
 def test_a_tracker_and_a_sphere(aacmm, folder, tmp_path):
     held = aacmm("show", folder / "tracker.h5").stdout
     for part in ("tracker", "frame of tracker", "centre of ball, radius of ball", "ball: certified diameter "):
@@ -197,6 +198,7 @@ def test_every_loss_is_for_python_and_the_command_line(aacmm, folder, several_ro
     assert aj.calibrate(arm, with_two, robust=robust).converged
 
 
+@pytest.mark.slow
 def test_a_loss_that_is_none_is_refused_with_the_list(aacmm, folder):
     for loss in LOSSES:
         assert loss in aacmm("calibrate", folder / "bad.h5", "--robust", "hubert", expect=2).stderr
@@ -245,6 +247,7 @@ def test_what_contradicts_is_left_out_on_request(aacmm, folder, tmp_path):
     assert aj.files.load_calibration(tmp_path / "d.h5").removed[0].probability < 1e-6
 
 
+@pytest.mark.slow
 def test_the_scale_of_the_nominal_arm(aacmm, folder):
     assert "no reference length" in aacmm("calibrate", folder / "free.h5", "-o", "c.h5", expect=2).stderr
     shown = aacmm("calibrate", folder / "free.h5", "-o", "c.h5", "--scale", "nominal").stdout
@@ -255,6 +258,7 @@ def test_the_scale_of_the_nominal_arm(aacmm, folder):
     assert found["calibrated"]["rms_mm"] < 0.1
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("command", "parts"),
     [
@@ -343,6 +347,7 @@ def test_poses_that_a_calibration_did_not_use_are_held_out(aacmm, folder):
     assert found["warnings"] == []
 
 
+@pytest.mark.slow
 def test_residuals_are_written_pose_by_pose(aacmm, folder, tmp_path):
     """By `calibrate` and by `evaluate`: the same distances of the poses that were used, whose geometry is the same."""
     command = ("calibrate", folder / "tracker.h5", "-o", "c.h5", "--hold-out", "ball", "--residuals", "c.csv")
@@ -432,6 +437,7 @@ def test_a_plan_with_a_kit(aacmm, tmp_path):
     assert "--kit itself determines the artefacts and their placement, so --sockets" in refused.stderr
 
 
+@pytest.mark.slow
 def test_a_kit_is_simulated(aacmm, tmp_path):
     kit = '[[points]]\nname = "tracker"\nbox = [[200, -300, 100], [600, 300, 500]]\nposes = 12\nu = 0.02\n'
     (tmp_path / "kit.toml").write_text(kit)

@@ -57,6 +57,7 @@ def content(folder):
 SIMULATE = ("simulate", "arm.toml", "--socket", "A=400,200,300", "--poses", 2)
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     "command",
     [
@@ -91,6 +92,7 @@ def test_an_input_is_no_output(aacmm, inputs, command):
     assert content(inputs) == before
 
 
+@pytest.mark.slow
 def test_one_path_is_not_two_outputs(aacmm, inputs):
     before = content(inputs)
     for first, second in (("x.png", "./x.png"), ("x.png", "link.png")):
@@ -101,6 +103,7 @@ def test_one_path_is_not_two_outputs(aacmm, inputs):
     assert content(inputs) == before
 
 
+@pytest.mark.slow
 def test_demo_leaves_other_files_alone(aacmm, inputs):
     """Neither a folder of other files, nor one that holds a capture of the same name."""
     before = content(inputs)
@@ -143,6 +146,7 @@ def test_what_a_command_replaces(tmp_path, new, own, foreign):
         temporary.write_bytes(new)
 
 
+@pytest.mark.slow
 def test_a_capture_of_somebody_else_is_not_replaced(aacmm, inputs):
     (inputs / "x.h5").write_bytes(FOREIGN)
     assert "x.h5 exists and is not an earlier output" in aacmm(*SIMULATE, "-o", "x.h5", expect=2).stderr
@@ -204,6 +208,7 @@ def test_the_robot_of_the_user_is_not_replaced(aacmm, tmp_path):
         aacmm("export", "y.h5", "-o", "calibrated.urdf")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("failing", ["figure", "replace"])
 def test_all_outputs_or_none(aacmm, inputs, monkeypatch, failing):
     """A command that fails at its second output, or while it puts them in place, leaves the first as it was."""
@@ -224,6 +229,7 @@ def test_all_outputs_or_none(aacmm, inputs, monkeypatch, failing):
         assert content(inputs) == before
 
 
+@pytest.mark.slow
 def test_outputs_are_checked_before_any_work(aacmm, inputs):
     (inputs / "old.png").touch(0o444)
     done = aacmm("calibrate", "none.h5", "-o", "c2.h5", "--figure", "old.png", expect=2)
@@ -247,6 +253,7 @@ def test_a_read_only_file_is_refused(tmp_path):
     assert_refused(lambda: outputs.write_text(tmp_path / "file", ""), "it is read-only", "another output path")
 
 
+@pytest.mark.slow
 def test_leftovers_of_killed_processes_are_removed(tmp_path):
     """Those of the same output only, and not that of a process that is still writing."""
     program = (
@@ -264,6 +271,7 @@ def test_leftovers_of_killed_processes_are_removed(tmp_path):
     assert [path.name[:7] for path in tmp_path.glob(".*.part")] == [".b.txt."]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("before", [(), ("--",)])
 def test_overwrite_is_an_option_only_before_two_hyphens(aacmm, inputs, before):
     (inputs / "x.h5").write_bytes(FOREIGN)
@@ -271,6 +279,7 @@ def test_overwrite_is_an_option_only_before_two_hyphens(aacmm, inputs, before):
     assert ((inputs / "x.h5").read_bytes() == FOREIGN) == bool(before), said.stderr
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     "command", ["import", "simulate", "calibrate", "evaluate", "report", "export", "plan", "study"]
 )

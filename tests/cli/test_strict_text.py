@@ -38,6 +38,7 @@ def test_what_is_printed(text, shown):
     assert printable(text) == shown
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("options", "part"),
     [
@@ -59,6 +60,7 @@ def test_options(aacmm, tmp_path, options, part):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "part"),
     [
@@ -75,6 +77,7 @@ def test_other_commands(aacmm, tmp_path, command, part):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("text", [10_000 * "n", 5_000 * "n ", "\x1b[2J"])
 @pytest.mark.parametrize(
     "command",
@@ -95,6 +98,7 @@ def test_long_arguments(aacmm, command, text):
     assert "\x1b" not in said
 
 
+@pytest.mark.slow
 def test_names_from_a_file_do_not_reach_the_terminal_raw(aacmm, tmp_path, paper_capture):
     """ESC in the name of an arm, which only Python can put into a file."""
     arm = aj.files.load_specification("cheng2018-simulation")._replace(name="\x1b]0;owned\x07arm")

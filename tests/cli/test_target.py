@@ -17,6 +17,7 @@ def test_a_board_is_written_with_the_lines_of_its_manifest(aacmm, tmp_path):
     aacmm("target", "checkerboard", "--squares", "5x4", "--size-mm", 30, "-o", "board.pdf")  # its own file
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["charuco", "aruco", "april"])
 def test_markers_have_a_usual_size_and_dictionary(aacmm, kind):
     pytest.importorskip("cv2")
@@ -26,6 +27,7 @@ def test_markers_have_a_usual_size_and_dictionary(aacmm, kind):
     assert board.dictionary == {"april": "apriltag_36h11"}.get(kind, "4x4_100")
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [

@@ -34,6 +34,7 @@ def run(tmp_path, monkeypatch):
     return lambda *arguments: CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("columns", [60, 80, 120])
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_shows_every_option_whole(monkeypatch, capsys, command, columns):
@@ -50,6 +51,7 @@ def test_help_shows_every_option_whole(monkeypatch, capsys, command, columns):
     assert max(map(len, head.splitlines())) <= columns
 
 
+@pytest.mark.slow
 def test_help_lists_every_command_whole(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "80")
     get_command(app).main(["--help"], "aacmm", standalone_mode=False)
@@ -134,6 +136,7 @@ def test_a_decision_rule_is_named_only_where_there_is_a_limit(monkeypatch, capsy
     assert ("ISO 14253-1" in capsys.readouterr().out) == said
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::aacmm_jax.core.errors.IdentifiabilityWarning")
 def test_a_residual_that_no_arm_has_is_not_called_converged():
     """Positions and quaternions read as joint readings: every solve ends, and nothing was calibrated."""
@@ -254,6 +257,7 @@ REFUSED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("arguments", "said"), REFUSED, ids=lambda value: value[-1])
 def test_options_are_refused_before_any_work(run, tmp_path, arguments, said):
     (tmp_path / "there.h5").touch()

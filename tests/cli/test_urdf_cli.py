@@ -19,6 +19,7 @@ def robot(tmp_path) -> Path:
     return Path(shutil.copy(FILE, tmp_path / "robot.urdf"))
 
 
+@pytest.mark.slow
 def test_urdf_to_calibrated_urdf(aacmm, tmp_path, robot):
     noise = ("--encoder-arcsec", "2", "--seating-mm", "0.005", "--deviate-length-mm", "1", "--deviate-angle-deg", "0.1")
     aacmm("simulate", "robot.urdf", "--tip", "tool0", *SOCKETS, "--poses", "15", *noise, "-o", "capture.h5")

@@ -42,6 +42,7 @@ FOLDERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "imports"),
     [
@@ -63,6 +64,7 @@ def test_folder(tmp_path, case, imports):
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "above", "settings", "reason"),
     [
@@ -127,6 +129,7 @@ PLANTED = {
 }
 
 
+@pytest.mark.slow
 @root
 @pytest.mark.parametrize("case", PLANTED)
 def test_what_another_user_can_have_written_is_not_used(tmp_path, case):

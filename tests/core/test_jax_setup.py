@@ -92,6 +92,7 @@ def test_commands_without_the_device_that_is_asked_for(aacmm_process, monkeypatc
 SOCKETS = {"A": (400, 200, 300), "B": (600, 200, 300)}
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     "entry",
     [

@@ -35,6 +35,7 @@ def symmetric(values, seed):
     return (matrix + matrix.T) / 2
 
 
+@pytest.mark.slow
 @settings(max_examples=example_count(50))
 @given(spectra(), st.booleans())
 def test_eigenvalues_and_eigenvectors(spectrum, singular):
@@ -51,6 +52,7 @@ def test_eigenvalues_and_eigenvectors(spectrum, singular):
     np.testing.assert_allclose((vectors * found) @ vectors.T, matrix, rtol=0, atol=3 * size)
 
 
+@pytest.mark.slow
 @settings(max_examples=example_count(40))
 @given(st.sampled_from(SIZES), st.integers(0, 2**32 - 1), st.floats(0, 60))
 def test_singular_values_keep_their_relative_accuracy_whatever_the_scale_of_columns(size, seed, decades):
@@ -113,6 +115,7 @@ def test_what_is_not_positive_definite_gives_nan_and_spoils_no_other():
     assert not np.isfinite(solution[1:]).all(axis=1).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch", [(3,), (2, 2)])
 def test_batches_and_vmap_equal_single_matrices(batch):
     random = np.random.default_rng(1)

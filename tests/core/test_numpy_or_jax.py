@@ -37,6 +37,7 @@ CALLS = {
 }
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("call", "width"),
     [
@@ -70,6 +71,7 @@ def test_numpy_equals_jax(arm, call, width):
             np.testing.assert_allclose(np.asarray(one) / scale, np.asarray(other) / scale, atol=1e-9, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("call", CALLS)
 def test_a_new_shape_compiles_nothing(arm, call):
     """A user's capture always has a new number of poses: nobody should wait for a compiler."""

@@ -49,6 +49,7 @@ def changed(settings):
             jax.config.update(name, value)
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("settings", [{}, SETTINGS], ids=["usual", "all changed"])
 def test_numbers_are_those_of_the_defaults(settings, expected):
     with changed(settings):

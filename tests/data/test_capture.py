@@ -8,6 +8,7 @@ import aacmm_jax as aj
 from ..refusals import assert_refused
 
 
+@pytest.mark.slow
 def test_degrees_are_recognized():
     """Of revolute joints; prismatic ones slide by hundreds of mm."""
     said = ["socket 'A' pose 2 joint 1 is 90 rad", "more than four revolutions", "probably in degrees", "numpy.deg2rad"]

@@ -30,6 +30,7 @@ def observed(capture: aj.Capture, arm: aj.Arm) -> tuple[Observed, aj.Parameters]
     return Observed.of(capture, arm), aj.Parameters.independent(arm)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("simulated", [BALL, PLATE, INNER], ids=["sphere", "plane", "inner link"])
 def test_exact_contacts_have_no_residual_and_exact_derivatives(simulated):
     capture = aj.simulate(TWO, {}, observations=[simulated], seed=1)
@@ -87,6 +88,7 @@ BESIDE = [[-200, -500, 200], [300, 100, 700]]
 TORSO_LINK = kinds.SimulatedSphereContact("link", BESIDE, (10, 0, 60), 30.0, 10, "left", "right", link=4)
 
 
+@pytest.mark.slow
 def test_joints_that_carry_both_bodies_are_read_once():
     torso, link = TORSO, TORSO_LINK
     plate = kinds.SimulatedPlaneContact("plate", BESIDE, (20, -40, 30), [[60, 0, 10], [0, 80, 0]], 10, "left", "right")
@@ -135,12 +137,14 @@ REFUSED = {
 }
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("says", REFUSED)
 def test_refused_in_one_sentence(says):
     with pytest.raises(aj.InputError, match=says):
         REFUSED[says]()
 
 
+@pytest.mark.slow
 def test_a_contact_without_its_other_pose_is_refused():
     capture = aj.simulate(TWO, {}, observations=[PLATE], seed=1)
     alone = aj.Capture({}, observations=capture.observations)

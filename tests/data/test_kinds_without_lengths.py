@@ -24,7 +24,7 @@ from aacmm_jax.data.observations.measured import AbstractInBox
 from aacmm_jax.data.observations.observation import FRAME, AbstractObservation, Rows
 from aacmm_jax.data.observations.simulated import OTHER_KINDS
 from aacmm_jax.files import manifest, manifest_tables
-from tests.conftest import command_line
+from tests.conftest import SLOW, command_line
 
 from .test_observations import POSES, TIPS, Q, check_derivatives, columns
 
@@ -177,7 +177,7 @@ def recording(kind, paper_arm):
     return aj.Recording(capture, nominal, true=nominal._replace(arm=true))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", params=SLOW)
 def files(recording, kind, tmp_path_factory):
     """Captures of that arm to calibrate from and to evaluate with; what the calibration prints, and its ``--json``."""
     folder = tmp_path_factory.mktemp(kind)
@@ -260,6 +260,7 @@ def test_cross_validation_predicts_the_distances(files):
         assert 0.5 < row["rms_mm"] / row["rms_predicted_mm"] < 2.0
 
 
+@pytest.mark.slow
 def test_evaluate_compares_with_what_was_predicted(files, kind):
     folder, _, _ = files
     shown = command_line(folder, "evaluate", "r.h5", "fresh.h5", "-o", "e.h5").stdout
@@ -274,6 +275,7 @@ def test_evaluate_compares_with_what_was_predicted(files, kind):
     assert "RMS distance of poses from their geometry" in Path(folder / "e.html").read_text()
 
 
+@pytest.mark.slow
 def test_reports_and_certificates_have_it(files, kind):
     folder, _, _ = files
     command_line(folder, "report", "r.h5", "-o", "r.html")
@@ -289,6 +291,7 @@ def test_reports_and_certificates_have_it(files, kind):
         aj.plot.residuals_by_kind(record, wrong)
 
 
+@pytest.mark.slow
 def test_sights_alone_calibrate_an_arm_whose_scale_is_that_of_its_anchor(recording, kind):
     """Nothing at all is in mm: neither the first weights, nor what is compared."""
     capture = aj.Capture({}, [], recording.capture.observations)
@@ -325,6 +328,7 @@ def test_a_manifest_reads_its_columns(recording, kind, tmp_path, monkeypatch):
         np.testing.assert_array_equal(getattr(again, name), getattr(sight, name))
 
 
+@pytest.mark.slow
 def test_plans_choose_poses_of_it(paper_arm, kind):
     item = aj.planning.KitItem(KINDS[kind][2]("sight", BOX, 20, FRAMES["left"]), places=0)
     planned = aj.planning.plan_kit(
@@ -334,6 +338,7 @@ def test_plans_choose_poses_of_it(paper_arm, kind):
     assert {one.kind for one in planned.observations} == {kind, "sphere"}
 
 
+@pytest.mark.slow
 def test_a_batch_of_arms_is_evaluated_alike(recording):
     """The same numbers from JAX as from NumPy, to rounding."""
     arms = [recording.nominal.arm, recording.true.arm]
@@ -366,6 +371,7 @@ class Exposures(Picture):
         return self.pixels[:, :2].T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["picture"], indirect=True, scope="module")
 def test_a_pose_may_have_more_residuals_than_its_tip_has_coordinates(recording):
     """Ten exposures of each pose count as one whose variance is a tenth."""

@@ -130,6 +130,7 @@ def test_files_and_summaries_have_it(paper_arm, capture, tmp_path):
     assert (stated["quantity"], stated["values"]) == ("standard deviation of the wire about its line", [0.01])
 
 
+@pytest.mark.slow
 def test_plans_place_it(paper_arm):
     turn = np.array([0.0, 0.0, np.pi / 2, 0.0, 0.0, 50.0])
     moved = WIRES[0].placed("elsewhere", turn)

@@ -111,6 +111,7 @@ def test_every_kind_is_here():
     assert {one.kind for one in ALL.values()} == known_kinds().keys() - CONTACTS
 
 
+@pytest.mark.first_rows(7)
 @pytest.mark.parametrize("name", ALL)
 def test_shapes_and_derivatives(name):
     observation = to_numpy(ALL[name])
@@ -191,6 +192,7 @@ def test_a_tip_in_the_centre_is_at_no_distance_in_no_direction(name, part):
     np.testing.assert_array_equal(rows.by_tip[0, :, 0], 0)
 
 
+@pytest.mark.slow
 def test_starts_are_exact_for_exact_data(paper_arm):
     """Without noise and by the true arm, the closed forms find the geometry, also of targets at an unknown place."""
     capture = aj.simulate(paper_arm, {}, observations=SIMULATED, seed=3)
@@ -272,6 +274,7 @@ def test_what_is_certified_is_that_of_the_artefact(name, certified, stated):
     assert {one.says for one in certified_quantities(observation) if one.unit != "mm"} == set()
 
 
+@pytest.mark.first_rows(9)
 @pytest.mark.parametrize("name", ALL)
 def test_every_number_of_a_geometry_can_be_read(name):
     observation = to_numpy(ALL[name])
@@ -350,6 +353,7 @@ def touches(cylinder, arc, heights, count=12):
     return Rotation.random(random_state=cylinder).as_matrix() @ local + 400 * random.normal(size=(3, 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("shape", [(330, [0, 20]), (330, [0, 7, 14]), (100, [0, 30]), (330, [0, 130, 260, 400])])
 def test_cylinders_are_found_in_any_direction(shape, known):
@@ -361,6 +365,7 @@ def test_cylinders_are_found_in_any_direction(shape, known):
         assert np.abs(distances_from_axis(tips, axis)[0] - found).max() < 0.12
 
 
+@pytest.mark.slow
 def test_a_cylinder_is_fitted_under_jit_too():
     tips = touches(0, 330, [0, 20])
     axis, radius = fitted_cylinder(tips, None)

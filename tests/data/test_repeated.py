@@ -24,6 +24,7 @@ def numbers_of(result):
     return [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(result, eqx.is_array))]
 
 
+@pytest.mark.slow
 def test_copies_change_nothing(paper_arm, noisy_capture, copied):
     assert copied.sizes == noisy_capture.sizes
     assert len(copied.lengths) == 1

@@ -18,6 +18,7 @@ def recorded(arm: "aj.Arm", **noise) -> "aj.Capture":
     return simulate(arm, SOCKETS, poses={"A": 6, "B": 2}, lengths=[("A", "B", 0.002)], seed=5, **noise)
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("short", "noise"),
     [
@@ -48,6 +49,7 @@ def test_every_encoder_has_its_own_noise(paper_arm):
     np.testing.assert_array_equal(noisy[:, [0, 4]], exact[:, [0, 4]])
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("noise", "parts"),
     [

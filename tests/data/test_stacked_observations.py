@@ -87,6 +87,7 @@ def some_unknowns(observation, seed):
     return found
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("library", [np, jnp], ids=["numpy", "jax"])
 @pytest.mark.parametrize("name", STACKS)
 def test_a_stack_is_what_its_observations_are(name, library):
@@ -118,6 +119,7 @@ def test_a_stack_is_what_its_observations_are(name, library):
         np.testing.assert_allclose(rows.by_unknowns[names[0]], np.concatenate(expected, axis=-1), atol=1e-9)
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("name", [*ALL, "shifted"])
 def test_derivatives_are_those_of_jax(name):
     """By unknowns that all poses share and by those of each pose, which are equal here; also under vmap."""
@@ -147,6 +149,7 @@ def test_derivatives_are_those_of_jax(name):
     np.testing.assert_allclose(one.measured[1], rows.measured, atol=1e-12)
 
 
+@pytest.mark.first_rows(17)
 @pytest.mark.parametrize("name", ALL)
 def test_what_is_linear_has_derivatives_that_depend_on_nothing(name):
     observation = to_numpy(ALL[name])

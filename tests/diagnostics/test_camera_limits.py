@@ -21,6 +21,7 @@ def one_axis(eye):
     return eye.changed(q=q)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "change", "code"),
     [

@@ -62,6 +62,7 @@ def named(found):
     return [(one.kind, [suspect.group for suspect in one.suspects]) for one in found]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "kind"), [("T2", "station"), ("bar 1", "placement")])
 def test_joint_3_shifted_in_one_station_or_placement(calibrate, mixed, name, kind):
     record = calibrate(changed(mixed, name, "q", 3e-4 * np.eye(6)[2]))
@@ -84,12 +85,14 @@ def solved(record, capture):
     return aj.calibrate(arm, capture, record.recording.nominal.bounds(), undetermined="ignore")
 
 
+@pytest.mark.slow
 def test_nothing_is_left_out_of_right_data(calibrate, mixed):
     record = calibrate(mixed)
     assert contradictions_of(record) == []
     assert remove_contradicting(record, lambda part: pytest.fail("there was nothing to leave out")) is record
 
 
+@pytest.mark.slow
 def test_of_two_parts_of_a_bumped_station_either_may_be_wrong(calibrate, mixed):
     first, second = (mixed.observations[0].select(rows) for rows in (range(12), range(12, 25)))
     moved = np.asarray(second.points) + np.array([0.2, 0, 0])
@@ -100,6 +103,7 @@ def test_of_two_parts_of_a_bumped_station_either_may_be_wrong(calibrate, mixed):
     assert remove_contradicting(record, lambda part: pytest.fail("the data do not show which is wrong")) is record
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("offset", "joint", "expected"),
     [((0, 0, 0), 0.0, []), ((0.05, -0.03, 0.04), 0.0, PROBE), ((0, 0, 0), 5e-4, ("theta_3",))],
@@ -155,6 +159,7 @@ def several_placements(paper_arm):
     return aj.simulate(paper_arm, HOLES, poses=12, lengths=lengths, seed=3, **noise)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shifted", "radians", "said"),
     [
@@ -178,6 +183,7 @@ def test_joint_3_shifted_in_some_sockets_only(paper_arm, several_placements, shi
         assert "the others scatter by 0.01" in found[0]
 
 
+@pytest.mark.slow
 def test_of_two_sockets_either_may_be_wrong(paper_arm):
     sockets, noise = {"A": (400, 200, 300), "B": (600, 200, 300)}, {"encoder_arcsec": 2.0, "seating": 0.005}
     lengths = [aj.ReferenceLength("A", "B", 200.0, 0.002)]
@@ -195,6 +201,7 @@ def test_without_noise(paper_arm):
     assert contradictions(calibrated(paper_arm, capture)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("removed", "expected"),
     [

@@ -55,6 +55,7 @@ def from_pose(first, last=80):
     return lambda count: ((np.arange(count) >= first) & (np.arange(count) < last)).astype(float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("errors", "code", "concerns", "words"),
     [
@@ -84,6 +85,7 @@ def test_the_cause_stands_first(paper_arm, capture, errors, code, concerns, word
     assert [finding.code for finding in others if finding.severity != "note"] == []
 
 
+@pytest.mark.slow
 def test_a_sound_capture_has_no_cause(paper_arm, capture):
     nominal = ArmSpecification(paper_arm, "test")
     record = aj.calibrate_capture(aj.Recording(capture, nominal), automatic=False, cross_validate=False)
@@ -91,6 +93,7 @@ def test_a_sound_capture_has_no_cause(paper_arm, capture):
     assert [finding for finding in findings_of(record) if finding.severity != "note"] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["two-stage", "joint"])
 def test_a_parameter_that_is_fixed_at_a_wrong_value(paper_arm, capture, method):
     """An angle shows in the poses; a length that is fixed sets the scale of sockets."""
@@ -104,6 +107,7 @@ def test_a_parameter_that_is_fixed_at_a_wrong_value(paper_arm, capture, method):
     assert "--free alpha_3" in first.advice
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stated", [(), ("parameters",)])
 def test_it_is_freed_where_nobody_stated_that_it_is_fixed(paper_arm, capture, stated):
     held = (*aj.Parameters.free_of(paper_arm).held, "alpha_3")
@@ -118,6 +122,7 @@ def test_it_is_freed_where_nobody_stated_that_it_is_fixed(paper_arm, capture, st
     )
 
 
+@pytest.mark.slow
 def test_a_wrong_length_is_fixed(paper_arm, capture):
     held = (*aj.Parameters.free_of(paper_arm).held, "a_2")
     longer = paper_arm.replace(a_2=float(paper_arm.a[1]) + 1.0)
@@ -127,6 +132,7 @@ def test_a_wrong_length_is_fixed(paper_arm, capture):
     assert (first.code, first.severity, first.concerns) == ("scale-set-by-fixed-lengths", "doubt", ("a_2",))
 
 
+@pytest.mark.slow
 def test_one_of_two_lengths_is_mistyped(paper_arm):
     """The poses agree, so that no compliance is to be suspected."""
     drawn = aj.simulate(paper_arm, SOCKETS, poses=20, lengths=LENGTHS[:2], noise=NOISE, seed=3)
@@ -140,6 +146,7 @@ def test_one_of_two_lengths_is_mistyped(paper_arm):
     assert not any("compliant" in finding.sentence for finding in others)
 
 
+@pytest.mark.slow
 def test_lengths_that_all_scatter_accuse_no_single_one(paper_arm):
     """As errors of places make them scatter on a real arm."""
     pairs = [("A", "B"), ("C", "D"), ("A", "C"), ("B", "D"), ("A", "D"), ("B", "C")]

@@ -27,6 +27,7 @@ def with_lengths(capture, *lengths):
     return aj.Capture(capture.sockets, [aj.ReferenceLength(*length) for length in lengths])
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("factor", "said"),
     [
@@ -49,6 +50,7 @@ def test_a_wrong_reference_length(paper_arm, noisy_capture, factor, said):
     assert "Converged" not in text  # whatever the solver says
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("narrow", "held", "noise", "named"),
     [
@@ -77,6 +79,7 @@ def test_what_stands_against_the_division_is_named(tmp_path, narrow, held, noise
     assert [named[0] in text for text in said] == [True] * len(named)
 
 
+@pytest.mark.slow
 def test_one_length_of_three_that_disagrees(paper_arm):
     sockets = {"A": (400, 200, 300), "B": (600, 200, 300), "C": (400, 500, 300)}
     noise = {"encoder_arcsec": 2.0, "seating": 0.005}
@@ -90,6 +93,7 @@ def test_one_length_of_three_that_disagrees(paper_arm):
     assert "A - C differs by -" in text
 
 
+@pytest.mark.slow
 def test_a_pose_that_was_not_seated(paper_arm, noisy_capture):
     q = np.array(noisy_capture.q)
     q[12, 1] += 1e-3  # some tenths of a millimetre at the tip, tens of times the noise
@@ -101,6 +105,7 @@ def test_a_pose_that_was_not_seated(paper_arm, noisy_capture):
     assert "Far from" not in warnings_of(noisy_capture, paper_arm)[1]
 
 
+@pytest.mark.slow
 def test_redundant_and_too_few(paper_arm, noisy_capture):
     sockets = noisy_capture.sockets
     few = aj.Capture({"A": sockets["A"][:8], "B": sockets["B"][:2]}, noisy_capture.lengths)
@@ -159,6 +164,7 @@ def test_uncertainties_in_another_unit_are_named(paper_arm, u, said):
         assert of_recording(recording._replace(true=recording.nominal)) == []
 
 
+@pytest.mark.slow
 def test_every_diagnostic_says_where_it_stands(noisy_capture, paper_arm):
     """A module with a ``test`` is found by itself; its findings have all that a reader needs."""
     modules = diagnostics()

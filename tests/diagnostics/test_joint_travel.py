@@ -29,6 +29,7 @@ def test_a_slide_may_move_by_millimetres():
     assert [one.joint for one in standing_joints(arm, q)] == [1]
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("joint", [2, 4, 5])
 def test_a_link_between_joints_that_do_not_move_has_four_parameters_too_many(paper_arm, paper_capture, joint):
     """Two links become one, so that of their eight parameters only four can be told apart."""

@@ -22,6 +22,7 @@ SIMULATED = {
 }
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("mistake", "cause"),
     [
@@ -119,6 +120,7 @@ def marked(rows):
         yield pytest.param(names, field, mistake, cause, marks=marks, id=f"{names}-{cause}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("names", "field", "mistake", "cause"), list(marked(MISTAKES)))
 def test_observations(paper_arm, captures, names, field, mistake, cause):
     def concerned(capture):

@@ -77,6 +77,7 @@ def checked(arm, capture, given, **options):
     return tests, sentences(finding for module in MODULES for finding in module.test(case))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [True, False])
 def test_nothing_wrong(paper_arm, captured, given):
     found, said = checked(paper_arm, captured(), given)
@@ -88,6 +89,7 @@ def test_nothing_wrong(paper_arm, captured, given):
     assert rows_of_tests(found)["missing_terms"] == []
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("given", [True, False])
 @pytest.mark.parametrize(
     ("errors", "expected", "amplitude", "cause"),
@@ -108,6 +110,7 @@ def test_what_the_model_lacks_is_named(paper_arm, captured, given, errors, expec
     assert cause in sentence
 
 
+@pytest.mark.slow
 def test_gravity_is_named(paper_arm, captured):
     """Joint 2 bends under a weight at the tip, in proportion to how far it reaches out from the vertical axis 1."""
 
@@ -121,6 +124,7 @@ def test_gravity_is_named(paper_arm, captured):
     assert any("a joint or link that bends" in text for text in said)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [True, False])
 def test_a_noisy_encoder_is_named(paper_arm, captured, given):
     found, said = checked(paper_arm, captured(noise=FIVE_TIMES), given)
@@ -129,6 +133,7 @@ def test_a_noisy_encoder_is_named(paper_arm, captured, given):
     assert found.lengths.probability > model_errors.LEVEL
 
 
+@pytest.mark.slow
 def test_seats_that_shift_are_noticed(paper_arm, captured):
     """Four visits of five poses to each socket, which is elsewhere by 20 um each time."""
     shifts = np.repeat(np.random.default_rng(1).normal(0, 0.02, (16, 3)), 5, axis=0)
@@ -146,6 +151,7 @@ def test_seats_that_shift_are_noticed(paper_arm, captured):
     assert found.lengths is None  # a single one cannot disagree
 
 
+@pytest.mark.slow
 def test_a_wrong_length_among_three(paper_arm, captured):
     found, _ = checked(paper_arm, captured(wrong=0.1), True)
     assert found.lengths.probability < 1e-6
@@ -154,6 +160,7 @@ def test_a_wrong_length_among_three(paper_arm, captured):
     assert found.misfit.probability > model_errors.LEVEL
 
 
+@pytest.mark.slow
 def test_estimated_noise_against_that_of_the_class(paper_arm, captured):
     usual, _ = checked(paper_arm, captured(), False, class_noise=NOISE)
     assert usual.misfit.usual
@@ -165,6 +172,7 @@ def test_estimated_noise_against_that_of_the_class(paper_arm, captured):
     assert any("usual for such an arm" in text for text in said)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stated", "too"), [(0.5, "small"), (2.0, "large")])
 def test_noise_that_is_stated_wrongly(paper_arm, captured, stated, too):
     noise = aj.Noise(encoder_arcsec=2.0 * stated, seating=0.005 * stated)
@@ -176,6 +184,7 @@ def test_noise_that_is_stated_wrongly(paper_arm, captured, stated, too):
         model_tests(result)
 
 
+@pytest.mark.slow
 def test_observations_and_their_division_into_chunks(paper_arm, monkeypatch):
     """A tracker's points: encoder error and a wrong u are named, whether or not the poses are taken in chunks."""
     corners = [[200, -300, 100], [600, 300, 500]]
@@ -208,6 +217,7 @@ def test_observations_and_their_division_into_chunks(paper_arm, monkeypatch):
     assert checked(paper_arm, wrong, True)[0].misfit.degrees_of_freedom < found.misfit.degrees_of_freedom / 1.5
 
 
+@pytest.mark.slow
 def test_without_noise_nothing_is_checked(paper_arm):
     capture = aj.simulate(paper_arm, SOCKETS, poses=10, lengths=[("A", "B"), ("C", "D")], seed=0)
     found, _ = checked(paper_arm, capture, False)

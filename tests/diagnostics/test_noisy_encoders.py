@@ -43,6 +43,7 @@ def calibrated(arm, capture, **options):
     return aj.calibrate(arm, capture, bounds, undetermined="ignore", **options)
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("method", "given", "joint", "tracker"),
     [
@@ -88,6 +89,7 @@ def test_its_noise_is_estimated_and_weights_the_poses(paper_arm, captured, metho
     assert kept.weighting_noise is kept.given_noise
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [True, False])
 def test_where_none_is_noisier_or_the_model_is_wrong_nothing_is_replaced(paper_arm, captured, given):
     noise = STATED if given else None
@@ -98,6 +100,7 @@ def test_where_none_is_noisier_or_the_model_is_wrong_nothing_is_replaced(paper_a
     assert calibrated(paper_arm, aj.Capture(parts, captured(None).lengths), noise=noise).noisy_encoders == ()
 
 
+@pytest.mark.slow
 def test_a_seat_that_is_noisier_than_stated_is_no_encoder(paper_arm):
     noise = aj.Noise(encoder_arcsec=2.0, seating=0.03)
     capture = aj.simulate(paper_arm, SOCKETS, poses=20, lengths=LENGTHS, noise=noise, seed=4)
@@ -108,11 +111,13 @@ def test_a_seat_that_is_noisier_than_stated_is_no_encoder(paper_arm):
     assert tests.noisy_joint.probability > 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{"noise_model": "common"}, {"robust": "huber"}, {"replace_noise": False}])
 def test_what_has_another_noise_model_keeps_it(paper_arm, captured, options):
     assert calibrated(paper_arm, captured(3), **options).noisy_encoders == ()
 
 
+@pytest.mark.slow
 def test_file_summary_and_warning(paper_arm, captured, tmp_path):
     capture = captured(3)
     result = calibrated(paper_arm, capture, noise=STATED)
@@ -129,6 +134,7 @@ def test_file_summary_and_warning(paper_arm, captured, tmp_path):
     assert not any("Residuals are larger where" in text for text in summary["warnings"])  # it is explained
 
 
+@pytest.mark.slow
 def test_an_encoder_whose_noise_poses_do_not_determine_keeps_that_of_the_others(mukca):
     """One placement, whose poses hardly see one joint: its noise would be above ten degrees."""
     recording = aj.files.read_manifest(mukca / "panda_3_bis.toml")

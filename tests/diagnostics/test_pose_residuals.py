@@ -1,11 +1,13 @@
 """Residuals with their directions: as long as the distances, and along what each joint does to the tip."""
 
 import numpy as np
+import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.diagnostics.pose_residuals import observation_residuals, signed_residuals
 
 
+@pytest.mark.slow
 def test_residuals_of_observations_are_as_long_as_their_distances(observed_record):
     found = signed_residuals(observed_record)
     distance = np.concatenate([one.distance for one in observation_residuals(observed_record)])
@@ -14,6 +16,7 @@ def test_residuals_of_observations_are_as_long_as_their_distances(observed_recor
     np.testing.assert_allclose(np.linalg.norm(found.vector, axis=1)[full], distance[full], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_residuals_of_sockets_by_axis_and_along_what_each_joint_does(paper_arm):
     """Against tips less their centroid, and differences of the tip by the reading."""
     true = paper_arm.replace(a_2=63.0)

@@ -61,6 +61,7 @@ def residual(arm, hypothesis, evidence, lever):
     return np.sqrt(np.mean(squares))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["sockets", "base", "poses", "own frame"])
 def test_costs_of_halves_are_those_of_whole_chains(kind):
     random = np.random.default_rng(3)
@@ -104,6 +105,7 @@ def test_number_of_changes(order, signs, offsets, changes):
 # What is found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "signs", "offsets"),
     [
@@ -143,6 +145,7 @@ def ur10(mukca):
     return recording.nominal.arm, np.asarray(one.q)[rows], np.asarray(one.points)[rows]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "signs", "offsets"),
     [
@@ -160,6 +163,7 @@ def test_a_tracker_at_an_unknown_place(ur10, few, order, signs, offsets):
     assert found.fits == (signs == (1,) * 6)
 
 
+@pytest.mark.slow
 def test_units(paper_arm, few):
     q = np.random.default_rng(2).uniform(-1.5, 1.5, (12, 6))
     positions = np.asarray(paper_arm.position(q))
@@ -176,6 +180,7 @@ def test_units_of_readings_and_positions(paper_arm, few):
     assert (found.best.length, found.best.changes) == (1000.0, 2)
 
 
+@pytest.mark.slow
 def test_one_position_leaves_several_explanations_and_orientations_fewer(paper_arm, few):
     q = np.random.default_rng(5).uniform(-1.5, 1.5, (2, 6))
     poses = np.asarray(paper_arm.pose(q))
@@ -187,6 +192,7 @@ def test_one_position_leaves_several_explanations_and_orientations_fewer(paper_a
     assert len(two.others) < len(one.others)
 
 
+@pytest.mark.slow
 def test_a_wrist_that_is_flipped_is_the_same_arm(few):
     """Rz(q4 + pi) Ry(-q5) Rz(q6 + pi) = Rz(q4) Ry(q5) Rz(q6), so this explanation is no other one."""
     arm = aj.load_arm("iiwa14").replace(probe=(30, 0, 80))
@@ -197,6 +203,7 @@ def test_a_wrist_that_is_flipped_is_the_same_arm(few):
     assert all(other.rms > 50 for other in found.others)  # with another probe, perhaps: twice as far as its offset
 
 
+@pytest.mark.slow
 def test_readings_of_another_arm_are_not_explained(paper_arm, few):
     random = np.random.default_rng(0)
     q, sockets = random.uniform(-2, 2, (60, 6)), np.repeat([0, 1], 30)
@@ -246,6 +253,7 @@ def test_the_turn_of_a_zero_keeps_readings_within_the_limits(paper_arm, limits, 
     assert found.offsets[2] == pytest.approx(expected * math.pi)
 
 
+@pytest.mark.slow
 def test_alternatives_leave_alone_a_joint_that_stands_still(paper_arm, few):
     q = np.random.default_rng(5).uniform(-1.5, 1.5, (6, 6))
     q[:, 4] = 0.4
@@ -253,6 +261,7 @@ def test_alternatives_leave_alone_a_joint_that_stands_still(paper_arm, few):
     assert [(one.order, one.signs) for one in found.others] == [(PLAIN[:6], (-1, 1, 1, 1, 1, 1))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("own_frame", [True, False])
 def test_servos_have_one_middle(few, own_frame):
     """Counts of servos whose middle, 2048 of 4096, was not stated: a zero common to all joints, within the limits."""

@@ -73,6 +73,7 @@ def volume(poses):
     return aj.uncertainty.volume.sample_lengths(poses[2], 60, length=300.0, seed=3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "made", "kind", "low", "high"),
     [
@@ -108,6 +109,7 @@ def test_errors_are_found_with_their_size_and_cover_lengths(poses, method, made,
     assert np.mean(inside[False]) < np.mean(inside[True]) - 0.1
 
 
+@pytest.mark.slow
 def test_two_stages_leave_the_noise_of_single_poses_as_one_least_squares_does():
     # Every length of the Panda is free: a shorter anchor would take all residuals away, with them noise and moments,
     # where lengths say little of the scale.
@@ -130,6 +132,7 @@ def test_two_stages_leave_the_noise_of_single_poses_as_one_least_squares_does():
     np.testing.assert_allclose(np.diag(stages.shared.moments), np.diag(joint.shared.moments), rtol=0.5)
 
 
+@pytest.mark.slow
 def test_clean_calibrations_keep_their_covariance(poses):
     """Lengths leave errors of places possible, but only small ones."""
     for number in (2, 4):
@@ -143,6 +146,7 @@ def test_clean_calibrations_keep_their_covariance(poses):
             assert np.median(U[1] / U[0]) < 1.25
 
 
+@pytest.mark.slow
 def test_functions_that_the_model_lacks_move_other_poses_too(poses):
     result = calibrated(poses, captured(poses, 0, error=eccentric))
     uncertainty, q = aj.uncertainty_of(result), volume(poses)[0]
@@ -194,6 +198,7 @@ def test_chance_does_not_enlarge_intervals_without_an_effect(lengths, largest):
     assert 1 < factors[0] < min(largest, factors[1]), factors
 
 
+@pytest.mark.slow
 def test_two_stages_see_the_disagreement_of_short_lengths_as_one_least_squares_does(mukca):
     """Lengths of 50 mm and poses that scatter by 0.3 mm: the scale that the lengths leave open is one unknown."""
     recording = aj.files.read_manifest(mukca / "capture.toml")
@@ -204,6 +209,7 @@ def test_two_stages_see_the_disagreement_of_short_lengths_as_one_least_squares_d
     assert float(stages.shared.sd_of("places")) == pytest.approx(float(joint.shared.sd_of("places")), rel=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shift", "says"), [(0.0, False), (0.02, True)])
 def test_a_sentence_says_where_errors_of_places_decide_how_large_U_is(poses, shift, says):
     capture = captured(poses, 3, shift=shift, visit=POSES, lengths=2)
@@ -228,6 +234,7 @@ def test_monte_carlo_agrees_with_the_covariance(poses, made):
     assert 0.9 < np.median(np.quantile(np.abs(found - np.median(found, axis=0)), 0.95, axis=0) / linear) < 1.12
 
 
+@pytest.mark.slow
 def test_lengths_that_found_errors_explain_are_not_said_to_disagree(poses):
     made = {"visits": {"shift": 0.02, "visit": POSES}, "gear": {"error": lambda q: 1e-4 * q * (np.arange(6) == 1)}}
     for what, kind in {"visits": "places", "gear": "gear"}.items():
@@ -240,6 +247,7 @@ def test_lengths_that_found_errors_explain_are_not_said_to_disagree(poses):
     assert aj.diagnostics.model_tests(observed, capture).lengths.probability > 0.05
 
 
+@pytest.mark.slow
 def test_a_place_that_shifts_is_part_of_what_readings_and_new_lengths_owe(poses):
     capture = captured(poses, 2, shift=0.02, visit=POSES)
     result = calibrated(poses, capture)
@@ -257,6 +265,7 @@ def test_a_place_that_shifts_is_part_of_what_readings_and_new_lengths_owe(poses)
     assert np.all(predicted**2 > 1.9 * tau**2)
 
 
+@pytest.mark.slow
 def test_traced_calibrations_have_none(poses):
     capture = captured(poses, 0)
     result, cases = calibrated(poses, capture, shared_errors=False), []
@@ -270,6 +279,7 @@ def test_traced_calibrations_have_none(poses):
     assert amendable(result, capture) is not None
 
 
+@pytest.mark.slow
 def test_errors_of_places_are_the_same_from_observations(poses):
     """A prior that says nothing makes the general path solve the same problem."""
     capture = captured(poses, 2, shift=0.02, visit=POSES)
@@ -280,6 +290,7 @@ def test_errors_of_places_are_the_same_from_observations(poses):
     np.testing.assert_allclose(u[0], u[1], rtol=0.1)
 
 
+@pytest.mark.slow
 def test_a_file_keeps_them(poses, tmp_path):
     capture = captured(poses, 0, error=eccentric, shift=0.02, marked=True)
     usual = ArmNoise("robot", aj.Noise(encoder_arcsec=7.0, seating=0.03), "data sheet")
@@ -338,6 +349,7 @@ def test_lengths_of_a_real_arm_are_predicted_as_large_as_they_err():
     assert 0.6 * found.length_rms < found.length_u < 2.5 * found.length_rms
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robust", [pytest.param("tukey"), pytest.param("huber", marks=pytest.mark.slow)])
 def test_a_robust_loss_keeps_them(poses, robust):
     """A bad pose loses its weight, and the uncertainty of lengths is about that without this pose."""

@@ -30,6 +30,7 @@ def record_of(arm, capture, factor=1.0, u=1.0, wrong=(), automatic=False):
     return aj.calibrate_capture(recording, automatic=automatic, cross_validate=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.99, 1.0, 1.006])
 def test_a_wrong_scale_is_seen_in_all_lengths_of_the_arm(paper_arm, capture, factor):
     record = record_of(paper_arm, capture, factor)
@@ -41,12 +42,14 @@ def test_a_wrong_scale_is_seen_in_all_lengths_of_the_arm(paper_arm, capture, fac
     assert all(finding.severity == "doubt" for finding in said)
 
 
+@pytest.mark.slow
 def test_reference_lengths_that_agree_far_better_than_stated_have_too_large_a_u(paper_arm, capture):
     codes = [finding.code for finding in findings_of(record_of(paper_arm, capture, u=40.0))]
     assert "u-too-large" in codes
     assert "u-too-large" not in [finding.code for finding in findings_of(record_of(paper_arm, capture))]
 
 
+@pytest.mark.slow
 def test_no_model_is_taken_to_please_a_mistyped_length(paper_arm, capture):
     record = record_of(paper_arm, capture, wrong={2: 0.5}, automatic=True)
     first, *_ = findings_of(record)
@@ -54,6 +57,7 @@ def test_no_model_is_taken_to_please_a_mistyped_length(paper_arm, capture):
     assert not record.decisions
 
 
+@pytest.mark.slow
 def test_bounds_that_explain_most_stand_before_their_imitations(paper_arm, capture):
     off = paper_arm.replace(theta=np.asarray(paper_arm.theta) + 0.004 * (np.arange(6) == 2))
     nominal = ArmSpecification(off, "test", override={"theta_3": 1e-3})
@@ -63,6 +67,7 @@ def test_bounds_that_explain_most_stand_before_their_imitations(paper_arm, captu
     assert first.explains > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("other", "u", "names"), [(0.02, 0.2, ("near", "far")), (0.2, 0.02, ()), (0.02, 0.02, ())])
 def test_an_instrument_that_agrees_far_better_than_stated(paper_arm, other, u, names):
     """A second one that is far worse than it should be makes the first one no better."""

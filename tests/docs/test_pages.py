@@ -59,6 +59,7 @@ def marks(page: str) -> list[pytest.MarkDecorator]:
     return [pytest.mark.slow] if snippets(page) else []
 
 
+@pytest.mark.first_rows(3)
 @pytest.mark.parametrize("page", [pytest.param(page, marks=marks(page)) for page in PAGES])
 def test_snippets_run(page, tmp_path, monkeypatch):
     (tmp_path / "examples").symlink_to(ROOT / "examples", target_is_directory=True)

@@ -120,6 +120,7 @@ def test_pages_have_no_serious_finding_of_axe(page, name, scheme):
     assert not serious, serious
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("title", re.findall(r"\[`(.+?)`\][([]", (DOCS / "troubleshooting.md").read_text("utf-8")))
 def test_troubleshooting_quotes_what_is_said(title):
     if not title.startswith("aacmm"):

@@ -17,6 +17,7 @@ CODE = re.findall(r"`([^`\n]+)`|^    (aacmm .+)$", SKILL, flags=re.MULTILINE)
 COMMANDS = sorted({match.group() for part in CODE for match in re.finditer(r"aacmm [a-z][a-z-]+", "".join(part))})
 
 
+@pytest.mark.first_rows(3)
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands_and_their_options_exist(command, tmp_path):
     printed = command_line(tmp_path, *command.split()[1:], "--help").stdout

@@ -111,6 +111,7 @@ def certain(record, u, degrees_of_freedom=math.inf):
     )
 
 
+@pytest.mark.slow
 def test_parameters_against_numbers_worked_out_by_hand(old, new):
     """Uncertainties of 3 and 4 steps make one of 5; 9.7 and 9.9 steps are either side of U = 9.80."""
     start = certain(old, 0.003)
@@ -151,6 +152,7 @@ def test_robust_covariances_take_hotelling(old, new):
     assert found.joint_test.p == pytest.approx(stats.f.sf(0.02**2 / 18e-6 * 60 / (80 * 21), 21, 60), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_only_what_both_determine_is_tested(old, new):
     """alpha_5 and d_6 trade off: changed together along the open direction they say nothing, across it they do."""
     pair, root = [old.names.index("alpha_5"), old.names.index("d_6")], math.sqrt(0.5)
@@ -221,6 +223,7 @@ def corrected(record, **values):
     )
 
 
+@pytest.mark.slow
 def test_coefficients_of_corrections_have_their_own_units(old):
     """1e-4 rad are 20.6 arcsec; of a gear it is ppm, of a compliance urad/m."""
     drift = compare(corrected(old), corrected(old, cos1_3=1e-4, gear_2=2e-4, compliance3_2=-3e-4))
@@ -245,6 +248,7 @@ def test_an_arm_without_corrections_is_compared_with_one_that_has_some(old):
     assert "Parameters free only in the new calibration: cos1_3, gear_2, compliance3_2" in " ".join(drift.warnings)
 
 
+@pytest.mark.slow
 def test_lengths_follow_the_scale(paper_arm, specification):
     """After two stages u(k) is in every length."""
     space = aj.Parameters.free_of(paper_arm)
@@ -261,6 +265,7 @@ def test_lengths_follow_the_scale(paper_arm, specification):
     assert found.u_scale_change == pytest.approx(math.sqrt(2) * record.u_k, rel=0.05)
 
 
+@pytest.mark.slow
 def test_lengths_are_those_of_the_two_arms(old, new):
     found = compare(old, new, points=50, length=250.0).lengths
     by = [
@@ -290,6 +295,7 @@ def test_lengths_are_those_of_the_two_arms(old, new):
     assert found.rms == pytest.approx(float(np.sqrt(np.mean((by[1] - by[0]) ** 2))))
 
 
+@pytest.mark.slow
 def test_an_arm_that_grew_measures_everything_longer(old, new):
     grown = old.calibrated._replace(arm=divided_arm(old.calibrated.arm, jnp.asarray(1 / 1.0002)))
     found = compare(old, new._replace(calibrated=grown))
@@ -391,6 +397,7 @@ WARNINGS = {
 }
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("case", WARNINGS)
 def test_what_makes_a_comparison_doubtful_is_said_first(old, new, case):
     change, text = WARNINGS[case]
@@ -422,6 +429,7 @@ def test_refused(old, new, ask, parts):
     assert_refused(lambda: ask(old, new, other), *parts)
 
 
+@pytest.mark.slow
 def test_a_trend_is_in_the_order_of_its_dates(calibrated):
     """Given last first; noon in Paris is before noon in London."""
     given = [calibrated[2 * PAIRS], calibrated[1], calibrated[0]]
@@ -443,6 +451,7 @@ def test_a_trend_is_in_the_order_of_its_dates(calibrated):
     assert [float(row["change"]) for row in rows[21:]] == alone.change.tolist()
 
 
+@pytest.mark.slow
 def test_figures_draw_the_numbers(calibrated, tmp_path):
     given, dates = [calibrated[i] for i in (0, 1, 2 * PAIRS)], ["2026-01-01", "2026-02-01", "2026-07-01"]
     table = trend(given, dates, points=40)
@@ -495,6 +504,7 @@ def files(calibrated, tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_command(run, files, calibrated):
     printed = run("a.h5", "c.h5")
     assert printed.exit_code == 0, printed.exception
@@ -565,6 +575,7 @@ def test_command_where_one_of_three_has_a_model_of_its_joints(run, files, calibr
     assert len((files / "table.csv").read_text().splitlines()) == 1 + 2 * (21 + 6)
 
 
+@pytest.mark.slow
 def test_command_refuses(run, files):
     """What is refused is raised, and becomes one sentence and exit code 2 in `main`; nothing is written."""
     before = sorted(files.iterdir())
@@ -587,6 +598,7 @@ def test_command_in_a_process_of_its_own(aacmm_process, files):
     assert refused.stderr.startswith("Error: a length of 100000 mm does not fit")
 
 
+@pytest.mark.slow
 def test_a_comparison_is_kept_shown_and_reported(run, files):
     """The file holds what was printed, and the report begins with the answer."""
     for names in (("a.h5", "b.h5"), ("a.h5", "b.h5", "c.h5")):
@@ -602,6 +614,7 @@ def test_a_comparison_is_kept_shown_and_reported(run, files):
         assert [part for part in parts if part[1:] not in page] == []
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("noise", [math.inf, 80.0])
 def test_a_change_that_is_called_detectable_is_found_in_95_of_100_cases(old, noise):
     """A change by that size has the noncentrality with which the test has this power."""
@@ -620,6 +633,7 @@ def test_a_change_that_is_called_detectable_is_found_in_95_of_100_cases(old, noi
     assert power == pytest.approx(0.95, abs=1e-3)
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("changes", "begins"),
     [
@@ -637,6 +651,7 @@ def test_the_answer_comes_first(old, new, changes, begins):
 REMOUNTED = {"probe_z": 0.3}  # the only coordinate of the probe that is free here
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("changes", "remounted"),
     [({}, None), (REMOUNTED, True), (MOVED, False), ({"a_2": 0.3}, False), ({"theta_2": 1e-3, **REMOUNTED}, False)],
@@ -658,6 +673,7 @@ def test_a_remounted_probe_is_told_from_a_changed_arm(old, new, changes, remount
         assert "so the arm has not changed" in said
 
 
+@pytest.mark.slow
 def test_sessions_of_a_real_arm_with_the_ball_remounted(mukca):
     records = []
     for name in ("panda_3", "panda_3_bis"):

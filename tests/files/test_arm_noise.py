@@ -39,6 +39,7 @@ def test_repeatability_is_what_simulated_visits_show():
     assert np.sqrt(np.mean(found**2)) == pytest.approx(0.1, rel=0.12)
 
 
+@pytest.mark.slow
 def test_shipped_arms():
     """Robots by their data sheets, measuring arms by their class."""
     assert load_noise("panda").arm_class == "robot"
@@ -58,6 +59,7 @@ def test_shipped_arms():
     assert encoder(load_noise("so100")) == pytest.approx(288, rel=0.01)  # a step of a servo with 4096 counts is 316
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::aacmm_jax.core.errors.IdentifiabilityWarning")
 def test_a_hobby_arm_may_leave_residuals_that_no_measuring_arm_leaves():
     """Its class says so; without it a mistake is looked for. Exchanged joints leave more than any class does."""
@@ -79,6 +81,7 @@ def test_a_hobby_arm_may_leave_residuals_that_no_measuring_arm_leaves():
         )
 
 
+@pytest.mark.slow
 def test_a_simulated_capture_keeps_what_is_usual_for_its_arm(aacmm, tmp_path):
     aacmm("simulate", "so100", "-o", "c.h5", "--socket", "A=0,-200,150", "--poses", 2)
     usual = aj.files.load_capture(tmp_path / "c.h5").usual

@@ -18,6 +18,7 @@ from aacmm_jax.files.arm_tables import (
 )
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("joints", [1, 2, 3, 6, 7, 20])
 def test_the_template_loads(tmp_path, joints):
     (tmp_path / "my.toml").write_text(arm_template(joints))

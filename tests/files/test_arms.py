@@ -152,6 +152,7 @@ def test_units_change_the_numbers_and_not_the_arm(tmp_path):
     assert in_m_and_rad.name == "arm"  # of the file, where it states none
 
 
+@pytest.mark.slow
 def test_saved_arm_reads_back_the_same_numbers(tmp_path):
     for name in aj.files.shipped_arms():
         arm = aj.load_arm(name)
@@ -256,6 +257,7 @@ joint = [
 """
 
 
+@pytest.mark.slow
 def test_a_file_without_identification_gets_independent_parameters(tmp_path):
     """Three parallel axes: two of their offsets are fixed, and Hayati's angles are free instead; also after a round
     trip."""

@@ -107,6 +107,7 @@ def test_a_cell_of_a_file(tmp_path):
     assert set(load_cell("panda", tmp_path / "cell.toml", radius=33.0).cell.body.radius[:-1]) == {33.0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MESHES)
 def test_shapes_of_a_urdf_are_held_by_capsules(tmp_path, name):
     """All vertices of box and mesh, and the cylinder's rims, at several configurations, placed here by the joints."""
@@ -144,6 +145,7 @@ def test_a_bounding_capsule_holds_its_points(points):
     assert np.linalg.norm(end - start) + 2 * radius <= 2 * widest + 1e-9
 
 
+@pytest.mark.slow
 def test_meshes_that_are_not_at_hand(tmp_path):
     """The links' other shapes stand for them, or capsules about the D-H row; both are said."""
     path = written(tmp_path, "two.dae")
@@ -183,6 +185,7 @@ def test_refused(tmp_path, change, text):
         load_cell("panda", tmp_path / "cell.toml")
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("change", "text"),
     [
@@ -199,6 +202,7 @@ def test_refused_shapes(tmp_path, change, text):
         load_cell(path)
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("content", [b"solid nothing\n", b"vertex 1 2 x\n", b"vertex nan 0 0\n"])
 def test_refused_meshes(tmp_path, content):
     path = written(tmp_path, "text.stl")

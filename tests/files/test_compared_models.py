@@ -40,6 +40,7 @@ def test_what_was_saved_is_read(file):
     assert_refused(lambda: aj.files.load_capture(file), "contains a model comparison")
 
 
+@pytest.mark.first_rows(3)
 @pytest.mark.parametrize(
     ("changed", "says"),
     [
@@ -58,6 +59,7 @@ def test_what_makes_no_sense_is_refused(tmp_path, changed, says):
     assert_refused(lambda: write_report(tmp_path / "models.h5", tmp_path / "report.html"), says)
 
 
+@pytest.mark.slow
 def test_it_is_shown_and_reported(file, aacmm, tmp_path):
     assert json.loads(aacmm("show", "models.h5", "--json").stdout) == SUMMARY
     assert "Recommended: dh" in aacmm("show", "models.h5").stdout

@@ -66,6 +66,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.first_rows(13)
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
 def test_changed_content_is_refused(path, change):
     changed(path, change)
@@ -128,6 +129,7 @@ HOSTILE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("change", "part"), HOSTILE.values(), ids=HOSTILE.keys())
 def test_nothing_leads_out_of_a_file(path, change, part, monkeypatch):
     """Whoever makes such a file on purpose can seal it, too."""
@@ -139,6 +141,7 @@ def test_nothing_leads_out_of_a_file(path, change, part, monkeypatch):
     assert_refused(lambda: read_tables(path, KIND), path, part, "give a file written by aacmm")
 
 
+@pytest.mark.slow
 def test_many_texts_that_are_one(path, monkeypatch):
     """Text is counted while it is read: a thousand elements may refer to the same long text."""
     write_tables(path, "capture", {"t": Table(columns("row", name=(["é" * 40] * 2000, "", "name")))}, {})

@@ -41,6 +41,7 @@ def written(turned: Rotation, convention: str, unit: str) -> np.ndarray:
     return np.degrees(angles) if unit == "deg" else angles
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("convention", "unit"),
     [

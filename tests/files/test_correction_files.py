@@ -30,6 +30,7 @@ def same(one: aj.Arm, other: aj.Arm) -> bool:
     return jax.tree.structure(one) == jax.tree.structure(other) and all(map(np.array_equal, *leaves))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("masses", [pytest.param({}, marks=pytest.mark.slow), MASSES])
 def test_files_bring_the_same_arm_back(masses, tmp_path):
     arm = corrected(**masses)
@@ -41,6 +42,7 @@ def test_files_bring_the_same_arm_back(masses, tmp_path):
     assert same(arm, aj.files.load_capture(tmp_path / "capture.h5").nominal.arm)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("torques", [False, True])
 def test_an_arm_with_a_thermometer_comes_back(torques, tmp_path):
     """Readings in every table, with what was recorded beside them; and the arm, with and without expansion."""
@@ -68,6 +70,7 @@ def plain_toml():
     return specification_toml(aj.kinematics.ArmSpecification(arm), proposed=False)
 
 
+@pytest.mark.slow
 def test_a_model_in_an_arm_file(tmp_path):
     plain = plain_toml()
     file = tmp_path / "arm.toml"
@@ -88,6 +91,7 @@ def test_a_model_in_an_arm_file(tmp_path):
             aj.load_arm(file)
 
 
+@pytest.mark.slow
 def test_expansion_of_an_arm_file_is_free_at_several_temperatures(tmp_path):
     """Of a manifest, also with the same model on the command line, and of a study."""
     (tmp_path / "arm.toml").write_text(plain_toml() + '\n[corrections]\nmodel = "expansion"\n')

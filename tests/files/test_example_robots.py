@@ -116,6 +116,7 @@ class Differences:
         assert self.rotation <= 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
     "every", [pytest.param(15, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.exhaustive)]

@@ -121,6 +121,7 @@ BAD = {
 }
 
 
+@pytest.mark.first_rows(19)
 @pytest.mark.parametrize("kind", LOAD)
 @pytest.mark.parametrize(("make", "parts"), BAD.values(), ids=BAD.keys())
 def test_bad_file(tmp_path, good, kind, make, parts):
@@ -129,6 +130,7 @@ def test_bad_file(tmp_path, good, kind, make, parts):
     assert_refused(lambda: LOAD[kind](path), path, *parts)
 
 
+@pytest.mark.slow
 def test_a_capture_is_no_calibration(tmp_path, good):
     path = good.files["capture"]
     assert_refused(lambda: aj.files.load_calibration(path), path, "contains a capture", "give a calibration file")
@@ -162,6 +164,7 @@ def folder_of(path: Path) -> list[str]:
 WRITERS = ("capture", "calibration", "arm")
 
 
+@pytest.mark.first_rows(7)
 @pytest.mark.parametrize("what", WRITERS)
 @pytest.mark.parametrize(
     ("place", "reason"),
@@ -187,6 +190,7 @@ def test_unwritable_place(tmp_path, good, what, place, reason):
     assert Path("/dev/null").is_char_device()
 
 
+@pytest.mark.first_rows(3)
 @pytest.mark.parametrize(
     ("error", "existing"),
     [
@@ -402,6 +406,7 @@ def plain(value):
 quickly = settings(max_examples=example_count(8), suppress_health_check=[HealthCheck.too_slow])
 
 
+@pytest.mark.slow
 @given(st.data())
 @quickly
 def test_round_trip_of_a_capture(tmp_path_factory, data):
@@ -418,6 +423,7 @@ def test_round_trip_of_a_capture(tmp_path_factory, data):
     assert read.seed == seed
 
 
+@pytest.mark.slow
 @given(arms())
 @quickly
 def test_round_trip_of_an_arm(tmp_path_factory, drawn):
@@ -454,6 +460,7 @@ def test_round_trip_of_a_calibration(tmp_path, good):
             assert value == (str(expected) if name == "reason" else expected), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("held", [(), ("d_1", "theta_1")], ids=["nothing held", "two held"])
 def test_names_with_a_comma(tmp_path, good, held):
     """Lists of names are lists in the file."""
@@ -530,6 +537,7 @@ DIMENSIONS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", LOAD)
 def test_xarray_reads_every_table(good, kind):
     xarray = pytest.importorskip("xarray")

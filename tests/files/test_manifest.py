@@ -136,6 +136,7 @@ def test_visits_of_sessions_and_targets(tmp_path, motion):
         read(tmp_path, HEAD + ANGLES + socket.format("A") + 'target = "ball"\n' + other)
 
 
+@pytest.mark.first_rows(4)
 @pytest.mark.parametrize(
     ("angles", "reading"),
     [
@@ -232,6 +233,7 @@ FILES = (
 )
 
 
+@pytest.mark.first_rows(5)
 @pytest.mark.parametrize(
     ("name", "file", "exclude", "expected"),
     [
@@ -289,6 +291,7 @@ LENGTH = '[[length]]\nfrom = "a"\nto = "b"\nvalue = 200.0\n'
 PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
 
 
+@pytest.mark.first_rows(16)
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
@@ -477,6 +480,7 @@ def test_bad_manifest(tmp_path, motion, text, parts):
     assert_refused(lambda: read(tmp_path, text), tmp_path / "capture.toml", *parts)
 
 
+@pytest.mark.first_rows(9)
 @pytest.mark.parametrize(
     ("content", "parts"),
     [
@@ -586,7 +590,9 @@ def test_what_is_stated_of_the_readings(tmp_path, motion, angles, socket, stated
     recording = aj.files.read_manifest(tmp_path / "capture.toml")
     assert recording.stated == stated
     aj.files.save_capture(tmp_path / "capture.h5", recording)
-    assert aj.files.load_capture(tmp_path / "capture.h5").stated == stated
+    again = aj.files.load_capture(tmp_path / "capture.h5")
+    assert again.stated == stated
+    assert again.read_as == ((1, 2, 3, 4, 5, 6) if "sign" in stated else None)
 
 
 def test_the_time_of_day_of_a_date_is_left_out(tmp_path, motion):

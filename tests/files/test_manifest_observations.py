@@ -38,6 +38,7 @@ def test_every_kind_has_a_table():
     assert set(TABLES) == set(known_kinds().values()) - {Pixels}  # tests/files/test_manifest_pixels.py
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("table", "stated", "factor"),
     [
@@ -114,6 +115,7 @@ PRESETS = {
 }  # fmt: skip
 
 
+@pytest.mark.first_rows(3)
 @pytest.mark.parametrize("name", PRESETS)
 @pytest.mark.parametrize("delimiter", [",", ";"])
 def test_presets(tmp_path, name, delimiter):
@@ -140,6 +142,7 @@ def test_columns_by_number_and_readings_in_a_file_of_their_own(tmp_path):
     assert (one.name, one.station) == ("tracker", "S1")
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("rotation", "numbers", "unit"),
     [
@@ -238,6 +241,7 @@ def test_touched_surfaces_and_files_by_name(tmp_path):
     assert (plane.name, socket.target) == ("wall", "T")
 
 
+@pytest.mark.first_rows(10)
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
@@ -343,6 +347,7 @@ def test_the_robot_of_the_examples(mukca):
     assert one.q.shape == (2772, 6)
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("mark", [",", "."])
 def test_the_robots_own_files(tmp_path, mark):
     """As their authors published them: semicolons and decimal commas, standard deviations beside each coordinate."""

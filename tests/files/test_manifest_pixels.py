@@ -56,6 +56,7 @@ def read(tmp_path, text=TARGET + CAMERA + PIXELS, changes=()):
     return aj.files.read_manifest(tmp_path / "capture.toml")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("images", [True, False])
 def test_a_table_of_corners_is_read_and_comes_back_from_a_file(tmp_path, seen, images):
     order = [3, 0, 1, 2, *range(4, 8)] if images else None
@@ -76,6 +77,7 @@ def test_a_table_of_corners_is_read_and_comes_back_from_a_file(tmp_path, seen, i
     assert loaded.capture.observations[0].ids == pixels.ids
 
 
+@pytest.mark.slow
 def test_a_column_divides_the_images_into_groups(tmp_path, seen):
     """Observations of one camera and one target, which can be held out by name."""
     files(tmp_path, seen)
@@ -92,6 +94,7 @@ def test_a_column_divides_the_images_into_groups(tmp_path, seen):
     assert [part.name for part in kept.observations] == ["webcam/left"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lists", ["all", "ids", "points", "plain", "records"])
 def test_nested_lists(tmp_path, seen, lists):
     files(tmp_path, seen, images=False)
@@ -110,6 +113,7 @@ def test_nested_lists(tmp_path, seen, lists):
     np.testing.assert_allclose(pixels.points, seen.points)
 
 
+@pytest.mark.slow
 def test_absent_corners_and_images(tmp_path, seen):
     files(tmp_path, seen)
     lines = (tmp_path / "corners.csv").read_text().splitlines()
@@ -128,6 +132,7 @@ def test_absent_corners_and_images(tmp_path, seen):
     assert aj.files.load_capture(tmp_path / "capture.h5").capture.observations[0].ids == pixels.ids
 
 
+@pytest.mark.slow
 def test_what_is_known_of_the_camera(tmp_path, seen):
     files(tmp_path, seen)
     stated = "intrinsics = { fx = 600, fy = 610, cx = 319.5, cy = 239.5 }\nu = { fx = 2.0, fy = 2.0 }\n"
@@ -144,6 +149,7 @@ def test_what_is_known_of_the_camera(tmp_path, seen):
 BAR = "bar = { nominal = 150.0, measured = 150.3, u = 0.05 }\n"
 
 
+@pytest.mark.slow
 def test_a_measured_bar_scales_the_points(tmp_path, seen):
     files(tmp_path, seen)
     (pixels,) = read(tmp_path, TARGET + BAR + CAMERA + PIXELS).capture.observations
@@ -151,6 +157,7 @@ def test_a_measured_bar_scales_the_points(tmp_path, seen):
     assert pixels.u_scale == pytest.approx(0.05 / 150)
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("changes", "parts"),
     [
@@ -199,6 +206,7 @@ def test_corners_that_cannot_be_those_of_the_target_are_refused(tmp_path, seen, 
     assert_refused(lambda: read(tmp_path, KNOWN, changes), "img_0.png", "another target, its rows and columns")
 
 
+@pytest.mark.slow
 def test_columns_named_as_the_joints_of_a_urdf_are_the_readings(tmp_path, seen):
     """In any order, beside other columns of numbers; the arm of this URDF need not fit the images."""
     names = ["pan", "lift", "elbow", "roll", "pitch", "yaw"]
@@ -228,6 +236,7 @@ LARGER = KNOWN.replace("319.5", "959.5").replace("239.5", "539.5").replace("[640
 FEW, ON_A_LINE, BEHIND = "only 3 corners", "its 5 corners are on one line", "the board is seen from behind"
 
 
+@pytest.mark.first_rows(3)
 @pytest.mark.parametrize(
     ("change", "text", "parts"),
     [
@@ -272,6 +281,7 @@ def test_two_images_of_one_pose_are_refused(tmp_path, seen):
     assert_refused(lambda: read(tmp_path), "img_0.png", "img_1.png", "same joint readings")
 
 
+@pytest.mark.slow
 def test_as_many_poses_as_images(tmp_path, seen):
     files(tmp_path, seen, images=False)
     lines = (tmp_path / "corners.csv").read_text().splitlines()
@@ -297,6 +307,7 @@ def part_of_example(folder, count):
     return rows
 
 
+@pytest.mark.slow
 def test_corners_are_detected_once_where_readings_are_commanded_and_measured(tmp_path, monkeypatch):
     """The manifest is read again with the other readings."""
     pytest.importorskip("cv2")
@@ -316,6 +327,7 @@ def test_corners_are_detected_once_where_readings_are_commanded_and_measured(tmp
     assert len(recording.other_readings.capture.observations[0].q) == len(detected) == 2
 
 
+@pytest.mark.slow
 def test_a_damaged_image_and_one_of_too_many_pixels_are_not_used(tmp_path):
     """A sentence for each; the others are used."""
     cv2 = pytest.importorskip("cv2")
@@ -330,6 +342,7 @@ def test_a_damaged_image_and_one_of_too_many_pixels_are_not_used(tmp_path):
         assert image.refused == "is not an image that OpenCV reads, is damaged, or has more than 120 million px"
 
 
+@pytest.mark.slow
 def test_images_are_read_and_drawn(tmp_path):
     cv2 = pytest.importorskip("cv2")
     rows = part_of_example(tmp_path, 3)
@@ -354,6 +367,7 @@ def test_images_are_read_and_drawn(tmp_path):
     assert aj.files.load_capture(tmp_path / "capture.h5").images == recording.images
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("picture", ["no base64!", "aGVsbG8=", JPEG_OF_HUGE_SIZE], ids=["text", "no JPEG", "huge"])
 def test_a_picture_in_a_file_that_a_browser_should_not_decode_is_refused(tmp_path, seen, picture):
     files(tmp_path, seen)

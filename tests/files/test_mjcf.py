@@ -119,6 +119,7 @@ def poses(specification: ArmSpecification, arm: aj.Arm | None = None) -> np.ndar
     return chain.base @ np.asarray((chain.arm if arm is None else arm).pose(Q))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("base", "tip"), [("world", "tool"), ("base", "plain"), ("base", "flange"), ("world", "hand")])
 def test_chain_in_and_out(base, tip):
     nominal = read(TEXT, tip, base)
@@ -159,6 +160,7 @@ def test_one_zero_offset_changes_one_body(change):
     assert_same(poses(read(exported.text, "tool")), poses(nominal, arm))
 
 
+@pytest.mark.slow
 def test_a_tool_is_a_site_beside_the_tip():
     """Of a site that is the tip, and of a body without elements, which gets an end tag."""
     text = TEXT.replace('<body name="flange" pos="0 0 0.05"><geom/></body>', '<body name="flange" pos="0 0 0.05"/>')
@@ -172,6 +174,7 @@ def test_a_tool_is_a_site_beside_the_tip():
         assert_same(by_mujoco(exported.text, exported.tip), poses(nominal, arm))
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("seed", range(10))
 def test_any_orientation_and_axis(seed):
     """Random bodies, joints and orientations of every kind, with six joints in any of the bodies."""
@@ -207,6 +210,7 @@ def test_any_orientation_and_axis(seed):
     assert_same(by_mujoco(exported.text, exported.tip), poses(nominal, arm))
 
 
+@pytest.mark.slow
 def test_files_and_defaults(tmp_path):
     """As a file, through a capture; the tip by default is the only body without one in it, whatever its sites."""
     text = re.sub(r'<body name="(finger|ball)".*?</body>', "", TEXT)
@@ -347,6 +351,7 @@ COUPLED = """<mujoco>
 </mujoco>"""
 
 
+@pytest.mark.slow
 def test_several_tips_and_an_equality_are_a_robot(tmp_path):
     """MuJoCo finds the equality fulfilled, and the tips where the robot has them, as read and after an export."""
     mujoco = pytest.importorskip("mujoco")

@@ -93,6 +93,7 @@ def same(one, other):
         assert np.array_equal(a, b) if isinstance(a, np.ndarray) or hasattr(a, "dtype") else a == b, field
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("kind", known_kinds())
 @given(seed=st.integers(0, 10**6), some=st.booleans())
 @settings(max_examples=example_count(3), suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -116,6 +117,7 @@ def test_some_poses_of_an_observation(kind):
     assert some.unknowns.keys() == one.unknowns.keys() - left_out  # of contacts, sockets of poses that are left out
 
 
+@pytest.mark.slow
 def test_xarray_reads_the_table(tmp_path):
     xarray = pytest.importorskip("xarray")
     draw = np.random.default_rng(0)

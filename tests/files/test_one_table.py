@@ -80,6 +80,7 @@ WAYS = {
 }
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("way", WAYS)
 def test_one_table_is_read_as_the_files_are(tmp_path, way):
     """Rows of different files may be mixed, as long as those of one are in order."""

@@ -37,6 +37,7 @@ def parts(prior):
     return numbers["sd"], numbers["mean"], learned
 
 
+@pytest.mark.slow
 def test_an_arm_file_states_its_prior(tmp_path):
     path, again = tmp_path / "arm.toml", tmp_path / "again.toml"
     path.write_text(ARM + PRIORS)

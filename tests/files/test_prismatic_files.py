@@ -77,6 +77,7 @@ def test_a_capture_file_gives_back_arms_and_readings(tmp_path):
     assert arm_summary(nominal)["joints"][2]["limits_mm"] == [50.0, 350.0]
 
 
+@pytest.mark.slow
 def test_a_calibration_file_keeps_the_noise_of_linear_encoders(tmp_path):
     from aacmm_jax.calibration.record import record_of
     from aacmm_jax.files.calibrations import load_calibration, save_calibration
@@ -95,6 +96,7 @@ def test_a_calibration_file_keeps_the_noise_of_linear_encoders(tmp_path):
     assert found.method == "joint"
 
 
+@pytest.mark.slow
 def test_a_manifest_states_the_unit_of_slides(tmp_path):
     """In m, or counts; signs and offsets hold for them too. Degrees of the other joints are refused as radians."""
     aj.files.save_arm(SCARA, tmp_path / "arm.toml")

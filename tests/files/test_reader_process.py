@@ -49,6 +49,7 @@ def assert_readable(path):
     assert read_tables(path, KIND).attributes["scale"] == 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limit", ["CPU time", "clock"])
 def test_an_endless_file_is_damaged(path, endless, monkeypatch, limit):
     monkeypatch.setattr(reader_process, "_CPU_SECONDS", 0.2 if limit == "CPU time" else 10)
@@ -58,6 +59,7 @@ def test_an_endless_file_is_damaged(path, endless, monkeypatch, limit):
     assert_readable(path)
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_waiting_for_an_endless_file(path, endless, monkeypatch):
     assert_readable(path)
     monkeypatch.setattr(reader_process, "_CPU_SECONDS", 60)
@@ -72,6 +74,7 @@ def test_ctrl_c_ends_waiting_for_an_endless_file(path, endless, monkeypatch):
     assert_readable(path)
 
 
+@pytest.mark.slow
 def test_memory_is_limited(path, monkeypatch):
     """A large array of zeros that HDF5 has not stored."""
     with h5py.File(path, "a") as file:
@@ -86,6 +89,7 @@ def test_memory_is_limited(path, monkeypatch):
     assert_refused(lambda: read_tables(path, KIND), path, "is damaged", "create it again")
 
 
+@pytest.mark.slow
 def test_a_child_that_has_ended_is_replaced(path):
     assert_readable(path)
     first = process()
@@ -96,6 +100,7 @@ def test_a_child_that_has_ended_is_replaced(path):
     assert first.stdin.closed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("executable", "reason"),
     [("/no/such/program", "no such file"), (shutil.which("false"), "exit status 1")],
@@ -108,6 +113,7 @@ def test_a_child_that_does_not_start_is_no_damage(path, monkeypatch, executable,
     assert_readable(path)
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("executable", ["", None])
 def test_without_an_interpreter_files_with_their_sha256_are_read(path, monkeypatch, executable):
     monkeypatch.setattr(sys, "executable", executable)
@@ -128,6 +134,7 @@ def test_nothing_is_imported_from_the_current_folder(path, tmp_path, monkeypatch
     assert not (tmp_path / "imported").exists()
 
 
+@pytest.mark.slow
 def test_threads_take_turns(path):
     reader_process._reader.stop()
     found = []

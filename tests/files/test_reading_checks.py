@@ -69,6 +69,7 @@ def manifest(folder, pattern):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("pattern", "other"), [("q_cmd_*", "measured"), ("q_[0-9]*", "commanded")])
 def test_a_manifest_s_recording_has_the_other_ones(both, pattern, other):
     recording = aj.files.read_manifest(manifest(both, pattern))
@@ -132,6 +133,7 @@ def recorded(order, offsets):
 COUNTS = 4096 / (2 * math.pi)
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("header", "size", "angles", "socket"),
     [

@@ -75,6 +75,7 @@ def test_several_tips_are_a_robot(urdf):
             np.testing.assert_allclose(chosen.pose(chain.readings(q)), plain.pose(q), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_calibrated_robot_is_written_back(urdf):
     nominal = aj.files.load_specification(urdf)
     assert aj.files.urdf_of(nominal.arm, nominal).text == ROBOT
@@ -144,6 +145,7 @@ def two_arms(tmp_path: Path) -> tuple[Path, np.ndarray]:
     return tmp_path / "two.toml", base
 
 
+@pytest.mark.slow
 def test_bases_are_found_from_what_two_arms_touched(two_arms):
     path, base = two_arms
     recording = aj.files.read_manifest(path)
@@ -160,6 +162,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("line", REFUSED)
 def test_manifests_are_refused_in_one_sentence(two_arms, line):
     path, _ = two_arms
@@ -187,6 +190,7 @@ def test_bad_files_are_refused_in_one_sentence(tmp_path, what):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_the_body_of_a_robot_has_the_collision_shapes_of_all_chains_once(tmp_path):
     shape = '<collision><geometry><sphere radius="0.05"/></geometry></collision>'
     path = tmp_path / "two.urdf"
@@ -237,6 +241,7 @@ NO_LINKS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", [*LINKS, *NO_LINKS])
 def test_contacts_of_a_manifest_name_the_sockets_of_the_other_chain(urdf, tmp_path, line):
     q = np.random.default_rng(0).uniform(-1, 1, (6, 4))

@@ -101,6 +101,7 @@ def described(name: str, folder: Path) -> aj.Arm:
     return aj.load_arm(str(found[0].locate()), base=base, tip=tip)
 
 
+@pytest.mark.first_rows(6)
 @pytest.mark.parametrize("name", [*ORIGINS, *FILES])
 def test_the_poses_are_those_of_its_urdf(tmp_path, name):
     arm, other = aj.load_arm(name), described(name, tmp_path)

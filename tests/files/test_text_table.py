@@ -177,6 +177,7 @@ def read(tmp_path, content, manifest, arm=ARM):
     return aj.files.read_manifest(tmp_path / "m.toml").capture
 
 
+@pytest.mark.first_rows(3)
 @pytest.mark.parametrize("recorder", RECORDERS)
 def test_tables_of_recorders(tmp_path, recorder):
     """The line that a refusal names is the one that makes the table be read."""
@@ -199,6 +200,7 @@ def test_there_are_twenty_of_them():
     assert len(RECORDERS) >= 20
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("columns", "stated"),
     [
@@ -238,6 +240,7 @@ HEADERS = ["rad", "deg", "gon", "grad", "mrad", "arcsec", "counts", "mm", "m", "
 SAME = {"\u00b0": "deg"}
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("header", HEADERS)
 def test_units_that_contradict_the_manifest(tmp_path, header):
     """In brackets of both kinds, at the end of names and in a row of their own; alone they serve, or are refused."""
@@ -301,6 +304,7 @@ JOINTS = ",".join(numbered("J{}")) + "\n"
 SIX = ",".join(f"{x}" for x in Q[0, :6]) + "\n"
 
 
+@pytest.mark.first_rows(10)
 @pytest.mark.parametrize(
     ("content", "stated", "parts"),
     [
@@ -361,6 +365,7 @@ def test_columns_of_positions(tmp_path, names, stated, part):
 NUMBERS = "0.12345,1.12345,2.12345,3.12345,4.12345,-2.12345\n"
 
 
+@pytest.mark.first_rows(9)
 @pytest.mark.parametrize(
     ("content", "parts"),
     [
@@ -431,6 +436,7 @@ def test_large_files_are_refused_before_they_are_read(tmp_path, monkeypatch):
     assert_refused(lambda: aj.files.read_manifest(tmp_path / "m.toml"), sentence)
 
 
+@pytest.mark.slow
 @hypothesis.settings(
     deadline=None, max_examples=25, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture]
 )

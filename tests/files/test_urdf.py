@@ -85,6 +85,7 @@ def test_readings_are_the_joint_values_of_the_file(nominal):
     np.testing.assert_allclose([turn[2, 1], turn[0, 2], turn[1, 0]], axis, atol=1e-6)
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("text", [TEXT, TEXT.replace("\n", "\r\n"), "\ufeff" + TEXT, TEXT.rstrip()])
 def test_uncalibrated_export_is_the_file_to_the_byte(tmp_path, text):
     path = written(tmp_path, text)
@@ -120,6 +121,7 @@ def test_one_zero_offset_changes_one_origin(tmp_path, nominal):
     assert 'xyz="0.35 0 0.03"' in after[line]  # only rpy changed
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(("tip", "probe"), [("flange", None), ("tool0", (3.0, -4.0, 100.0))])
 def test_a_tip_that_no_origin_moves_becomes_a_link(tmp_path, tip, probe):
@@ -283,6 +285,7 @@ REFUSED = {
 }  # fmt: skip
 
 
+@pytest.mark.first_rows(29)
 @pytest.mark.parametrize("case", REFUSED)
 def test_refusals_are_one_sentence(tmp_path, case):
     replacement, links, parts = REFUSED[case]

@@ -19,6 +19,7 @@ def test_numbers_stay_text_and_tags_are_ignored():
     assert yaml_content(text) == expected
 
 
+@pytest.mark.first_rows(8)
 @pytest.mark.parametrize(
     ("text", "says"),
     [

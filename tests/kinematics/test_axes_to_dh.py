@@ -77,6 +77,7 @@ def assert_same(poses, expected):
     np.testing.assert_allclose(poses[:3, :3], expected[:3, :3], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 @settings(max_examples=example_count(20))
 @given(
     chain=st.lists(st.tuples(TRANSFORMS, DIRECTIONS, st.booleans()), min_size=1, max_size=8),

@@ -52,6 +52,7 @@ def test_a_joint_yields_to_the_load(nominal):
     np.testing.assert_array_equal(soft.position([0.7, 0.0]), arm.position([0.7, 0.0]))
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("chains", [(), {"one": (1, 2), "other": (3, 4)}], ids=["arm", "robot"])
 def test_a_load_acts_at_its_centre(chains):
     """3 kg, 350 mm along the link and 20 mm across it, which is turned by q: its lever is 350 cos q - 20 sin q."""
@@ -79,6 +80,7 @@ def test_a_load_acts_at_its_centre(chains):
         np.testing.assert_allclose(alone.arm.position([*joints, 3.0]), yields.position([*at, 1, 3.0]), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_files_keep_the_centre_of_a_load(tmp_path):
     arm = aj.load_arm("ur10e").replace(load=True, load_centre=(1.0, 2.0, 60.0))
     aj.files.save_arm(arm, tmp_path / "arm.toml")
@@ -100,6 +102,7 @@ URDF = (
 )
 
 
+@pytest.mark.slow
 def test_a_manifest_states_the_centre_of_a_load_from_the_flange(tmp_path):
     """Of a URDF from its tip link: 2 kg, 50 mm beyond the flange, which is 300 mm from the axis."""
     (tmp_path / "one.urdf").write_text(URDF)

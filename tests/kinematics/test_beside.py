@@ -75,6 +75,7 @@ def test_a_simulated_capture_has_all_columns_and_comes_back(paper_arm, tmp_path)
     assert loaded.nominal.arm.recorded == arm.recorded
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("column", "value", "message"),
     [

@@ -59,6 +59,7 @@ def by_matrices(arm: aj.Arm, q: np.ndarray) -> np.ndarray:
     return pose @ slide(*np.asarray(arm.probe))
 
 
+@pytest.mark.first_rows(4)
 @pytest.mark.parametrize("beta", [False, True])
 @pytest.mark.parametrize(
     ("joints", "prismatic"), [(1, ()), (2, ()), (6, ()), (9, ()), (1, (1,)), (4, (3,)), (6, (1, 2, 3)), (7, (1, 7))]
@@ -71,6 +72,7 @@ def test_pose_is_the_textbook_product(joints, prismatic, beta):
     np.testing.assert_allclose(arm.position(q), expected[:, :3, 3], atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("beta", "prismatic"), [(False, ()), pytest.param(True, (), marks=pytest.mark.slow), (True, (1, 4))]
 )
@@ -132,6 +134,7 @@ def test_jacobian_is_jax_own_differentiation(joints, prismatic):
         np.testing.assert_allclose(analytic, other, rtol=0, atol=1e-12 * size)
 
 
+@pytest.mark.slow
 def test_second_derivatives_pass_through_the_rule():
     arm = random_arm(3, 1, prismatic=(2,))
     q = jnp.array([0.3, -70.0, 1.1])
@@ -189,6 +192,7 @@ def test_unknown_parameter_suggests_the_nearest():
         random_arm(3, 0).jacobian(np.zeros(3), ["alhpa_2"])
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_panda_equals_its_urdf():
     """Standard D-H against the maker's URDF, read by an independent library."""

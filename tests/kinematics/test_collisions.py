@@ -40,6 +40,7 @@ def configurations(arm, count=50):
     return np.random.default_rng(0).uniform(-2, 2, (count, arm.joints))
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("beta", [False, True])
 def test_capsules_are_along_the_skeleton(panda, beta):
     """Their ends are corners of the skeleton, which is computed in another way; also with Hayati's angle."""
@@ -83,6 +84,7 @@ def test_an_arm_that_folds_onto_itself(planar):
     assert nearest_contact(cell, planar, q[0]) == ("link a_1", "link a_3")
 
 
+@pytest.mark.slow
 def test_clearances_under_jit(panda):
     cell = Cell(body_along_links(panda, 60.0), (Box("box", (400, 0, 200), (200, 200, 200), (0.1, 0.2, 0.3)),))
     q = configurations(panda, 7)
@@ -219,6 +221,7 @@ def test_worked_distances(segments, distance):
     assert float(segment_distance(*map(column, segments))[0]) == pytest.approx(distance, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_under_jax_with_derivatives():
     """The same numbers under jit, and derivatives as differences say."""
     points = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3, 5)) * 100)

@@ -52,6 +52,7 @@ def readings(arm: aj.Arm) -> np.ndarray:
     return np.concatenate([q, random.uniform(10, 30, (4, arm.columns - arm.joints))], axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -90,6 +91,7 @@ def test_derivatives_are_exact(name, request):
             np.testing.assert_allclose(turned[i], central, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["elbow", pytest.param("scara", marks=pytest.mark.slow)])
 def test_all_lengths_grow_with_the_temperature(name, request):
     """2e-4 / K: at 25 C everything is 1.001 times as large, at 20 C and without a thermometer as it was."""
@@ -157,6 +159,7 @@ def test_functions_of_the_readings():
         np.testing.assert_allclose(corrected.position(q), arm.position(moved), atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [-1.0, 1.0])
 def test_a_full_coupling_moves_the_frames_of_gravity_and_the_reading(elbow, factor):
     """Joint 3 of parallel links: its moments are those at the angle that it has, and moving joint 2 moves both."""
@@ -183,6 +186,7 @@ def test_ranges_of_orders():
     assert terms_of("gear,functions", 2) == terms_of("gear,harmonics=1-31", 2)
 
 
+@pytest.mark.slow
 def test_the_nominal_arm_decides_the_functions(elbow):
     """A calibrated length changes no moment: what was calibrated is what is evaluated."""
     q, longer = readings(elbow), elbow.replace(d_3=400.0)
@@ -190,6 +194,7 @@ def test_the_nominal_arm_decides_the_functions(elbow):
     np.testing.assert_array_equal(before, after)
 
 
+@pytest.mark.first_rows(11)
 @pytest.mark.parametrize(
     ("model", "sentence"),
     [
@@ -225,6 +230,7 @@ def warm_capture(low: float, high: float) -> tuple[aj.Capture, aj.Bounds]:
     return capture, aj.Bounds.around(nominal, aj.Parameters.free_of(nominal))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -243,6 +249,7 @@ def test_expansion_is_found(options):
     assert abs(result.parameters[i] - 15e-6) < 3 * u
 
 
+@pytest.mark.slow
 def test_expansion_at_one_temperature_is_a_scale():
     """All lengths of the arm may be wrong by as much: the observability names them, and what would help."""
     capture, bounds = warm_capture(23, 23)
@@ -252,6 +259,7 @@ def test_expansion_at_one_temperature_is_a_scale():
     assert seen.remedy == "Poses in the same sockets at other temperatures would determine these parameters."
 
 
+@pytest.mark.slow
 def test_redrawn_readings_keep_their_temperature():
     capture, bounds = warm_capture(15, 25)
     result = aj.calibrate(bounds.space.base, capture, bounds)
@@ -261,6 +269,7 @@ def test_redrawn_readings_keep_their_temperature():
     assert np.all(np.ptp(drawn[..., :6], axis=0) > 0)
 
 
+@pytest.mark.slow
 def test_an_arm_that_expands_is_noticed():
     capture, bounds = warm_capture(15, 25)
     plain = with_corrections(bounds.space.base, "dh")
@@ -280,6 +289,7 @@ def eccentric() -> tuple[aj.Capture, aj.Bounds, np.ndarray]:
     return capture, aj.Bounds.around(arm, space), np.asarray(space.vector(true))
 
 
+@pytest.mark.slow
 def test_found_by_a_calibration():
     capture, bounds, true = eccentric()
     assert {"cos1_1", "sin1_4", "gear_2"} <= set(bounds.space.names)
@@ -287,6 +297,7 @@ def test_found_by_a_calibration():
     np.testing.assert_allclose(result.parameters, true, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_batches_of_corrected_arms(paper_arm):
     """As results of many have them, the nominal arms of their functions batched too; under vmap as well."""
     names = ["cos1_2", "gear_3", "compliance4_3", "compliance3_2"]

@@ -33,6 +33,7 @@ def within_limits(arm: aj.Arm, seed: int, count: int, part: float = 0.8) -> np.n
     return np.random.default_rng(seed).uniform(middle - part * half, middle + part * half, (count, arm.joints))
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("name", ARMS)
 @settings(max_examples=example_count(3))
 @given(seed=st.integers(0, 2**31))
@@ -61,6 +62,7 @@ def test_an_arm_without_errors_keeps_its_readings_to_the_bit():
     assert found.reached.all()
 
 
+@pytest.mark.slow
 def test_seven_joints_change_least():
     nominal = ARMS["panda"]
     calibrated, q = deviating(nominal, 3), np.array([0.1, 0.3, -0.2, -1.8, 0.2, 1.9, 0.6])
@@ -110,6 +112,7 @@ def test_outside_the_reach_is_said_with_the_distance():
     assert np.isfinite(found.q).all()
 
 
+@pytest.mark.slow
 def test_one_row_or_several_under_jit_and_vmap_and_its_derivative():
     nominal = ARMS["cheng2018-simulation"]
     calibrated, q = deviating(nominal, 0), within_limits(nominal, 0, 3, 0.5)
@@ -151,6 +154,7 @@ def test_an_arm_that_has_expanded():
     np.testing.assert_allclose(aj.kinematics.corrected_readings(nominal, calibrated, q).q, q, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_in_jax_all_go_on_until_the_last_has_arrived():
     """Those near a singularity come closer by it, and seeds of studies rest on which of them count as arrived."""
     arm, random = aj.load_arm("cheng2018-ra7125"), np.random.default_rng(0)

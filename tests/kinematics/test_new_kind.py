@@ -84,6 +84,7 @@ def test_a_calibration_finds_it(record):
     assert abs(value - BOW) < 4 * u < BOW
 
 
+@pytest.mark.slow
 def test_residuals_without_it_name_it(paper_arm, captured):
     space = aj.Parameters.free_of(paper_arm)
     bounds = aj.Bounds.around(paper_arm, space, length=5.0, angle=0.01)
@@ -101,6 +102,7 @@ def test_it_is_among_what_poses_may_share(paper_arm):
     assert "bow" in default_prior(with_corrections(paper_arm, "bow")).groups
 
 
+@pytest.mark.slow
 def test_it_is_stored_and_reported(record, tmp_path):
     aj.files.save_calibration(tmp_path / "bent.h5", record)
     again = aj.files.load_calibration(tmp_path / "bent.h5")

@@ -24,6 +24,7 @@ def test_replaced_parameters(panda):
     assert panda.replace(limits=None).limits is None
 
 
+@pytest.mark.slow
 def test_replaced_parameters_under_transformations(panda):
     q = jnp.full(7, 0.3)
     slope = jax.jit(jax.jacfwd(lambda value: panda.replace(d_3=value).position(q)))(317.0)

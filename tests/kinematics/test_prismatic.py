@@ -57,6 +57,7 @@ def test_numbers_of_joints_are_checked():
         aj.simulate(SCARA.replace(limits=None), {"A": (400, 100, 200)})
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("arm", "expected"),
     [

@@ -111,6 +111,7 @@ def test_a_batch_has_the_columns_of_each_robot():
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, atol=1e-9), many, one)
 
 
+@pytest.mark.slow
 def test_joints_that_follow_others_have_no_reading_of_their_own():
     plain = arm(rows(4, 4))
     whole = plain.replace(fixed=(2,), mimic=[(4, 3, -0.5, 0.1)])
@@ -131,6 +132,7 @@ def test_a_gear_ratio_is_that_of_the_joint_that_follows():
     np.testing.assert_allclose(geared.position(q), expected, atol=1e-9)
 
 
+@pytest.mark.first_rows(1)
 def test_default_parameters_are_independent(robot):
     whole = robot[1]
     names = default_names(whole)
@@ -151,6 +153,7 @@ def test_default_parameters_are_independent(robot):
     assert rank == both.shape[1] == most
 
 
+@pytest.mark.first_rows(3)
 def test_what_data_determine_is_as_many(robot):
     whole = robot[1]
     assert len(aj.Parameters.independent(whole).names) == len(default_names(whole))
@@ -216,6 +219,7 @@ def test_calibrated_together_within_their_uncertainty(mimic):
     assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=0.35)
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("model", ["harmonics=1,gear,coupled=2-3+10-11", "gravity", "backlash=gravity"])
 def test_a_chain_keeps_its_joint_corrections(model):
     _, whole, _ = ROBOTS["two bases"]

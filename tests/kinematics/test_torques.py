@@ -62,6 +62,7 @@ def test_columns_that_an_arm_does_not_have_are_refused(nominal):
         aj.evaluate(aj.load_arm("ur10e"), aj.Capture({"A": np.zeros((2, 12)) + np.eye(2, 12)}))
 
 
+@pytest.mark.slow
 def test_a_calibration_takes_torques_where_they_were_recorded(nominal):
     """By default, and with a payload that nobody stated: the torques have it."""
     true = aj.perturbed_arm(aj.Parameters.free_of(nominal), length=0.3, angle=5e-4, seed=1)
@@ -78,6 +79,7 @@ def test_a_calibration_takes_torques_where_they_were_recorded(nominal):
         assert abs(value_of(record.calibrated.arm, name) - value) < 3 * np.sqrt(record.covariance[number, number])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("masses", [{}, MASSES])
 def test_plans_determine_torques_by_masses_alone(nominal, masses):
     arm = with_corrections(aj.load_arm("ur10e"), "torque", **masses)

@@ -120,6 +120,7 @@ class Running:
 SLOWEST = ("SO-101 with a camera",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.exhaustive if n in SLOWEST else pytest.mark.slow) for n in ARMS]
 )

@@ -7,6 +7,7 @@ import pytest
 
 from aacmm_jax.live.server import serving
 
+from ..conftest import SLOW
 from .stub_session import StubSession
 
 WIDTHS = [(400, "dark"), pytest.param(1600, "light", marks=pytest.mark.slow)]
@@ -15,7 +16,7 @@ FRAMES = "least => Number(document.getElementById('view').dataset.frames) > leas
 MARKUP = "<img src=x onerror=document.title='caught'>\x1b[2J\u202e" + "very long " * 300
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", params=SLOW)
 def browser():
     api = pytest.importorskip("playwright.sync_api")
     chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -183,6 +184,7 @@ def test_what_a_device_says_is_text(shown):
         assert page.said == []
 
 
+@pytest.mark.slow
 def test_a_reloaded_page_and_a_second_one_show_the_same(shown):
     session = StubSession(poses=5)
     with serving(session) as address:
@@ -238,6 +240,7 @@ FOREIGN = """async ([address, token]) => {
 }"""
 
 
+@pytest.mark.slow
 def test_a_foreign_page_commands_and_reads_nothing_even_with_the_token(shown):
     session = StubSession()
     with serving(session) as address:

@@ -83,6 +83,7 @@ def test_the_places_and_poses_of_a_plan(tmp_path):
     assert [(length.start, length.end, float(length.value)) for length in setup.lengths] == [("A", "B", 500.01)]
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("change", "says"),
     [

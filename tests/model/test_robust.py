@@ -21,6 +21,7 @@ def test_tuning_constants_of_one_row_are_the_published_ones(name, constant):
     assert tuning_constant(name, 1) == constant
 
 
+@pytest.mark.first_rows(12)
 @pytest.mark.parametrize("rows", [1, 2, 3, 4, 6])
 @pytest.mark.parametrize("name", LOSSES)
 def test_tuning_constants_give_95_percent(name, rows):
@@ -57,6 +58,7 @@ def test_bounded_squares_of_normal_residuals(rows):
     assert expected == pytest.approx(distribution.expect(lambda x: np.minimum(x, most)) / rows, abs=1e-5)
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("name", LOSSES)
 def test_cost_weight_and_transformed_residual(name):
     """The weight is the derivative of the cost by half the square; transformed residuals have that cost."""
@@ -72,6 +74,7 @@ def test_cost_weight_and_transformed_residual(name):
     assert np.all(np.diff(weight[np.argsort(np.sum(white**2, axis=0))]) <= 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LOSSES)
 def test_the_curvature_is_that_of_the_cost(name):
     """Along a residual and across it, up to where it is no longer positive."""

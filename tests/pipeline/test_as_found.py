@@ -33,6 +33,7 @@ def imported(folder, line=""):
     return aj.files.read_manifest(folder / "capture.toml")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("there", [False, True])
 def test_columns(folder, there, capsys):
     recording = imported(folder, 'as_found = "installed.toml"\n' if there else "")
@@ -58,6 +59,7 @@ def test_columns(folder, there, capsys):
         assert ("as found" in (folder / "r.html").read_text(encoding="utf-8")) == there
 
 
+@pytest.mark.slow
 def test_terminal(folder, aacmm):
     imported(folder, 'as_found = "installed.toml"\n')
     aacmm("import", "capture.toml", "-o", "c.h5")
@@ -72,6 +74,7 @@ def test_another_arm_is_refused(folder):
     assert_refused(lambda: imported(folder, 'as_found = "so100"\n'), "as_found", "5 joints", "6")
 
 
+@pytest.mark.slow
 def test_a_report_without_tests_states_no_conformity(folder):
     record = aj.calibrate_capture(imported(folder), automatic=False, cross_validate=False)
     aj.files.save_calibration(folder / "k.h5", record)

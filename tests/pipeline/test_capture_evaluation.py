@@ -25,12 +25,14 @@ def record(recording):
     return aj.calibrate_capture(recording, cross_validate=False, shared_errors=False)
 
 
+@pytest.mark.slow
 def test_data_are_chosen_by_name(record, recording):
     chosen = aj.evaluate_capture(record, recording, only="A", measuring_range=None).recording
     assert (chosen.capture.names, chosen.capture.lengths) == (("A",), ())
     assert aj.evaluate_capture(record, recording, without=["A"]).recording.capture.names == ("B",)
 
 
+@pytest.mark.slow
 def test_the_measuring_range_is_that_of_the_recording_by_default(record, recording):
     stated = recording._replace(measuring_range=2000.0)
     for given, expected in ((None, 2000.0), (1800.0, 1800.0)):
@@ -40,6 +42,7 @@ def test_the_measuring_range_is_that_of_the_recording_by_default(record, recordi
         assert aj.evaluate_points(points, measuring_range=given).measured.measuring_range == expected
 
 
+@pytest.mark.slow
 def test_warnings_of_the_calibration_are_those_given_or_tested_again(record, recording):
     assert aj.evaluate_capture(record, recording, calibration_warnings=["Read this."]).calibration_warnings == (
         "Read this.",
@@ -55,6 +58,7 @@ def test_points_are_tested_to_all_standards_by_default():
     assert aj.evaluate_points(points, standards=["iso"]).standards == ("iso",)
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("options", "name"),
     [

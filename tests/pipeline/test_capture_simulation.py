@@ -55,6 +55,7 @@ def test_an_acceptance_test_is_simulated(nominal):
     assert {float(length.u) for length in recorded.capture.lengths} == {0.001}
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("sockets", "options", "parts"),
     [

@@ -46,6 +46,7 @@ def evaluated(record, capture, keep):
     return aj.evaluate_capture(record, aj.Recording(capture, record.recording.nominal), keep=keep)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("keep", [("target",), ("frame",), ("target", "frame")])
 def test_what_is_kept_is_that_of_the_calibration(tmp_path, record, keep):
     evaluation = evaluated(record[0], measured(record[2], record[1], 10), keep)
@@ -65,6 +66,7 @@ def test_what_is_kept_is_that_of_the_calibration(tmp_path, record, keep):
     np.testing.assert_allclose(np.sqrt(np.mean(tables[0].u ** 2)), errors.of(errors.parts).predicted, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_its_uncertainty_is_that_of_the_calibration(record):
     """By the parameters and for given parameters, together."""
     evaluation = evaluated(record[0], measured(record[2], record[1], 10), ("target", "frame"))
@@ -75,6 +77,7 @@ def test_its_uncertainty_is_that_of_the_calibration(record):
         np.testing.assert_allclose(whole[np.ix_(index, index)], record[0].observed.geometry_covariance[name], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_remounted_target_contradicts_one_that_is_kept(record):
     moved = measured(record[2], record[1], 10, moved=(0.0, 0.5, 0.0))
     for keep, holds in (((), True), (("frame",), True), (("target",), False)):
@@ -83,6 +86,7 @@ def test_a_remounted_target_contradicts_one_that_is_kept(record):
         assert (errors.of(errors.parts).probability > 0.01) == holds, keep
 
 
+@pytest.mark.slow
 def test_a_kept_frame_needs_fewer_poses(record):
     two = measured(record[2], record[1], 2)
     with pytest.raises(aj.InputError):
@@ -106,6 +110,7 @@ def test_errors_with_kept_geometry_are_as_predicted():
         assert abs(np.mean(found) - 1) < 3 * np.std(found) / np.sqrt(len(found)) + 0.02, keep
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("keep", ["target", "frame"])
 def test_what_is_not_there_cannot_be_kept(record, keep):
     nominal = record[0].recording.nominal

@@ -55,6 +55,7 @@ def sockets(paper_arm, space):
     return aj.simulate(true, points, poses=14, lengths=[("A", "B", 0.002)], noise=NOISE, seed=2)
 
 
+@pytest.mark.slow
 def test_a_region_is_predicted_as_by_a_calibration_without_it(paper_arm, space, bounds):
     """Of sockets, whose positions only the region shows, and a reference length between two of them."""
     capture, prior = sockets(paper_arm, space), aj.Prior({"lengths": 0.3, "angles": 5e-4})
@@ -77,6 +78,7 @@ def test_a_region_is_predicted_as_by_a_calibration_without_it(paper_arm, space, 
         assert np.sqrt(found.ratio) == pytest.approx(expected.rms / expected.predicted, rel=0.1)
 
 
+@pytest.mark.slow
 def test_half_of_a_travel_is_predicted_as_by_a_calibration_without_it(paper_arm, space, bounds):
     """The frame of the tracker is known from the other half."""
     capture, prior = seen_by_a_tracker(paper_arm, space), aj.Prior({"lengths": 0.3, "angles": 5e-4})
@@ -93,6 +95,7 @@ def test_half_of_a_travel_is_predicted_as_by_a_calibration_without_it(paper_arm,
     assert np.sqrt(found.mean_square) == pytest.approx(float(errors.rms[0]), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_nothing_wrong_needs_no_correction(paper_arm, space, bounds):
     found = compare_models(paper_arm, seen_by_a_tracker(paper_arm, space), bounds, models=MODELS)
     assert found.recommended.model == "dh"
@@ -117,6 +120,7 @@ def test_an_eccentric_encoder_is_recognised(paper_arm, space, bounds):
         assert abs(float(chosen.result.parameters[i]) - true) < 3 * u[i]
 
 
+@pytest.mark.slow
 def test_a_model_by_name_is_a_corrected_arm_with_its_prior(paper_arm, space, bounds):
     """In one line what takes four; in place of other corrections, and with the prior that is given instead."""
     capture = seen_by_a_tracker(paper_arm, space, "harmonics=1", cos1_2=4e-4)
@@ -172,6 +176,7 @@ def test_regions_exclude_and_evidence_decides_among_the_others(squares, evidence
     assert ComparedModels(models).recommended.model == expected
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(("outside", "taken"), [(0.99, True), (1.02, True), (1.05, False)])
 def test_a_model_that_predicts_worse_is_not_taken_by_default(monkeypatch, paper_arm, space, outside, taken):
     """However probable it makes the measurements: three regions cannot tell it from the arm alone."""
@@ -200,6 +205,7 @@ def test_a_model_that_predicts_worse_is_not_taken_by_default(monkeypatch, paper_
     assert any("Model of the joints: gravity" in says for says in chosen.decisions) == taken
 
 
+@pytest.mark.slow
 def test_a_model_that_the_data_cannot_carry_is_skipped(paper_arm, space, bounds):
     capture = sockets(paper_arm, space)
     compared = compare_models(paper_arm, capture, bounds, models=["dh", "harmonics=1-31"])
@@ -234,6 +240,7 @@ def test_the_evidence_is_that_of_a_gaussian(paper_arm, space, bounds):
     assert other - one == pytest.approx(second - first, abs=0.02)
 
 
+@pytest.mark.slow
 def test_refused(paper_arm, space, bounds):
     with pytest.raises(aj.InputError, match="models is empty"):
         compare_models(paper_arm, sockets(paper_arm, space), bounds, models=[])

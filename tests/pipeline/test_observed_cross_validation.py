@@ -34,6 +34,7 @@ def true(space):
     return aj.perturbed_arm(space, length=1.0, angle=np.deg2rad(0.1), seed=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", [pytest.param(case, marks=pytest.mark.slow if case != "region" else ()) for case in CASES]
 )
@@ -48,6 +49,7 @@ def test_honest_data_err_as_predicted(paper_arm, true, bounds, case):
     assert not checked.surprising
 
 
+@pytest.mark.slow
 def test_sockets_and_lengths_with_observations(paper_arm, true, bounds):
     points = {"A": (400, 200, 300), "B": (500, 300, 100), "C": (300, -300, 300)}
     capture = aj.simulate(
@@ -60,6 +62,7 @@ def test_sockets_and_lengths_with_observations(paper_arm, true, bounds):
     assert abs(float(checked.groups[0].length_error[0])) < 3 * checked.groups[0].length_u[0]
 
 
+@pytest.mark.slow
 def test_the_group_that_disagrees_is_seen(paper_arm, true, bounds):
     """A station in whose poses the arm gave way: found errors of that group are far above the predicted ones."""
     bent = true.replace(a=np.asarray(true.a) + np.array([0, 0.3, 0, 0, 0, 0]))
@@ -73,6 +76,7 @@ def test_the_group_that_disagrees_is_seen(paper_arm, true, bounds):
     assert checked.surprising
 
 
+@pytest.mark.slow
 def test_shared_geometry_is_left_out_together(paper_arm):
     capture = aj.simulate(paper_arm, {}, observations=[*STATIONS[:2], *SIMULATED["bars"]], noise=NOISE)
     assert groups_of(capture) == (("T0",), ("T1",), ("bar0",), ("bar1",), ("bar2",))
@@ -84,6 +88,7 @@ def test_shared_geometry_is_left_out_together(paper_arm):
         aj.cross_validate(paper_arm, few, aj.Bounds.around(paper_arm, aj.Parameters.independent(paper_arm)))
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("kind", SIMULATED)
 def test_some_poses_of_an_observation(paper_arm, kind):
     """Residuals of the poses that remain are what they were."""

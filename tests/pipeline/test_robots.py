@@ -53,6 +53,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("says", REFUSED)
 def test_what_is_for_one_arm_is_refused_in_one_sentence(says):
     with pytest.raises(aj.InputError, match=says) as error:

@@ -67,6 +67,7 @@ def test_stage_2_makes_every_way_agree(calibrations, paper_arm, noisy_capture):
     assert float(fixed.scale.value) == pytest.approx(float(two_stage.scale.value), rel=1e-14)
 
 
+@pytest.mark.slow
 def test_free_lengths_slide_to_a_bound_and_the_result_says_so(calibrations):
     """AUDIT: shrinking the arm lowers the misfit, so with noise and nothing held stage 1 shrinks until a bound stops
     it."""
@@ -80,6 +81,7 @@ def test_free_lengths_slide_to_a_bound_and_the_result_says_so(calibrations):
     assert abs(float(held.scale.value) - 753 / 750) < 1e-4  # held at its start, 3 mm too long
 
 
+@pytest.mark.slow
 def test_joint_solve_is_the_weighted_minimum(calibrations, space, noisy_capture):
     """Its gradient vanishes: recomputed here with the weights the contract states, by JAX and not by the package's
     model."""
@@ -179,6 +181,7 @@ def differentiated(request, paper_arm, noisy_capture, space):
 
 
 # Reverse has forward within it, and takes all inputs at once; the suite compiles reverse alone.
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["reverse", pytest.param("forward", marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("case", ["inactive", "active", "repeated"])
 @pytest.mark.parametrize("by", ["angles", "bounds", "length"])
@@ -220,6 +223,7 @@ def test_derivatives_of_a_calibration(paper_arm, noisy_capture, space, start, di
         assert total == pytest.approx(float(cotangent @ expected), rel=0, abs=1e-5 * largest + 1e-8)
 
 
+@pytest.mark.slow
 def test_hayatis_angle_tells_parallel_axes_apart():
     """Two parallel axes: d_2 and d_3 trade off exactly, so one is held, and the tilt that D-H lacks is found as
     beta."""
@@ -306,6 +310,7 @@ def test_uncertainty_of_k_is_unknown_without_any_scatter(paper_arm, noisy_captur
     assert np.isnan(float(aj.evaluate(paper_arm, single).repeatability.de))
 
 
+@pytest.mark.slow
 def test_a_known_length_leaves_nothing_more_to_hold(paper_arm, space):
     """With d_3 held by the user the scale is known, so "longest" holds nothing; a redundant held length changes
     nothing."""
@@ -319,6 +324,7 @@ def test_a_known_length_leaves_nothing_more_to_hold(paper_arm, space):
     assert float(result.arm.d[4]) == pytest.approx(501, abs=1e-8)
 
 
+@pytest.mark.slow
 def test_what_data_cannot_tell_apart_is_marked(paper_arm, noisy_capture):
     """With everything free: d_1 and theta_1 only move the base frame, and (a_6, theta_6), (alpha_6, d_6) trade off
     (AUDIT)."""
@@ -337,6 +343,7 @@ def test_what_data_cannot_tell_apart_is_marked(paper_arm, noisy_capture):
     )
 
 
+@pytest.mark.slow
 def test_what_does_not_converge_names_what_trades_off(paper_arm, noisy_capture, bounds, space):
     found = aj.calibrate(paper_arm, noisy_capture, bounds, max_steps=1)
     record = aj.calibration.record_of(found, aj.Recording(noisy_capture, aj.kinematics.ArmSpecification(paper_arm)))
@@ -349,6 +356,7 @@ def test_what_does_not_converge_names_what_trades_off(paper_arm, noisy_capture, 
     assert set(names) <= set(space.names)
 
 
+@pytest.mark.slow
 def test_the_true_arm_may_have_other_corrections(observed_record, paper_arm):
     """Or none: a parameter that it lacks is 0, and not that of another coefficient in its place."""
     nominal = aj.kinematics.with_corrections(paper_arm, "gear,gravity")

@@ -40,6 +40,7 @@ def planned(request):
     return aj.planning.plan_kit(ARM, [item], poses=8, space=SPACE, candidates=400, above=20.0, seed=1)
 
 
+@pytest.mark.slow
 def test_every_image_shows_the_whole_target(planned):
     """Within the image, at a distance and tilt that were stated, above the table and within the limits of joints."""
     [item], [seen] = planned.kit, planned.observations
@@ -63,11 +64,13 @@ def test_every_image_shows_the_whole_target(planned):
     assert np.all((q > low) & (q < high))
 
 
+@pytest.mark.slow
 def test_chosen_poses_determine_more_than_random_ones(planned):
     assert planned.predicted.median < planned.random.median
     assert planned.more.median < planned.predicted.median
 
 
+@pytest.mark.slow
 def test_the_manifest_of_a_plan_names_camera_and_target(planned, tmp_path):
     target = {"name": "board", "kind": "checkerboard", "squares": [7, 5], "size": 30.0}
     (tmp_path / "m.toml").write_text(plan_manifest(planned, "ur10e", targets=[target]))
@@ -86,6 +89,7 @@ def test_a_target_that_is_hardly_ever_seen_is_refused():
     assert_refused(lambda: set_up(problem.region, Thing(KitItem(item, 0), item), 200), "'images'", "move the target")
 
 
+@pytest.mark.slow
 def test_poses_from_both_sides(planned):
     """Every pose twice: each joint comes from one side and then from the other, as its columns say."""
     rows = [line.split(",") for line in plan_csv(planned, "rad", both_sides=True).splitlines()]
@@ -102,6 +106,7 @@ def test_poses_from_both_sides(planned):
             np.testing.assert_array_equal(np.array(there[-6:], float), sign * np.array(pose[-6:], float))
 
 
+@pytest.mark.slow
 def test_both_sides_need_a_tip_that_nothing_holds(planned):
     held = planned._replace(observations=(aj.data.observations.Socket("seat", np.zeros((1, 6))),))
     with pytest.raises(aj.InputError, match="'seat' is touched; plan for an instrument or camera"):

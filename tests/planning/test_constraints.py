@@ -63,6 +63,7 @@ def gaps(arm, q) -> dict[str, float]:
     }
 
 
+@pytest.mark.slow
 def test_every_pose_is_in_its_cone(panda, constrained):
     """By the last frame's z axis, socket by socket; and the tilts that the plan states."""
     tool = np.asarray(panda.arm.pose(constrained.q))[:, :3, 2]
@@ -76,6 +77,7 @@ def test_every_pose_is_in_its_cone(panda, constrained):
     np.testing.assert_allclose(panda.arm.position(constrained.q), points[constrained.owner], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_every_pose_is_clear(panda, constrained):
     """Of table, wall and box by sampled points of the body; no nearer than the plan states, nor than is allowed."""
     found = gaps(panda.arm, constrained.q)
@@ -88,6 +90,7 @@ def test_every_pose_is_clear(panda, constrained):
     assert min(gaps(panda.arm, everywhere).values()) < 0  # the check can fail
 
 
+@pytest.mark.slow
 def test_approach_points_and_straight_moves(panda, constrained):
     """40 mm along the normals; the moves between them are clear but where the plan says otherwise."""
     motion = constrained.motion
@@ -106,11 +109,13 @@ def test_approach_points_and_straight_moves(panda, constrained):
     assert motion.travel < motion.unordered
 
 
+@pytest.mark.slow
 def test_what_the_constraints_cost_is_predicted(constrained):
     assert constrained.predicted.largest < constrained.random.largest
     assert constrained.unconstrained.largest < constrained.predicted.largest
 
 
+@pytest.mark.slow
 def test_files_and_summary(constrained):
     lines = [line.split(",") for line in plan_csv(constrained, "rad").splitlines()]
     assert lines[0][:4] == ["pose", "move", "socket", "x_mm"]
@@ -130,6 +135,7 @@ def test_files_and_summary(constrained):
         assert row["largest_tilt_deg"] <= row["cone_deg"]
 
 
+@pytest.mark.slow
 def test_sockets_are_placed_within_their_own_cones(panda, monkeypatch):
     """Through all stages: random placements, their neighbours, chosen and moved poses; the names keep their cones."""
     for name, value in {"_PLACEMENTS": 12, "_NEIGHBOURS": 20, "_DESIGNED": 1, "_STARTS": 200}.items():
@@ -210,6 +216,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("case", REFUSED)
 def test_refused(panda, case):
     options, text = REFUSED[case]

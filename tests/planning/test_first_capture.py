@@ -10,6 +10,7 @@ from aacmm_jax.planning import first_capture as planned
 from aacmm_jax.planning.first_capture import determined_by, first_capture, still_joints
 
 
+@pytest.mark.slow
 def test_numbers_of_determined_parameters(paper_arm):
     """METROLOGY: 27 by positions for six revolute joints, 21 without the base, 20 without the scale."""
     sockets, length, tracker, target = determined_by(paper_arm).values()
@@ -18,12 +19,14 @@ def test_numbers_of_determined_parameters(paper_arm):
     assert any("the scale" in text for text in sockets.undetermined)
 
 
+@pytest.mark.slow
 def test_a_still_first_joint_hides_the_link_after_it(paper_arm):
     still = still_joints(paper_arm)
     assert {"a_1", "alpha_1"} <= set(still[0])
     assert all(lost is None or lost for lost in still)
 
 
+@pytest.mark.slow
 def test_predictions_follow_poses_and_noise(paper_arm, monkeypatch):
     monkeypatch.setattr(planned, "_PLACEMENTS", 2)
     noise = Noise(encoder_arcsec=2.0, seating=0.005)
@@ -56,6 +59,7 @@ def planar(limits):
     return aj.Arm(alpha=[np.pi / 2, 0, 0], a=[0, 300, 100], d=[200, 0, 0], limits=[(-3, 3), (-3, 3), limits])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("elbow", "nearest", "farthest"),
     [

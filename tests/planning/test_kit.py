@@ -125,6 +125,7 @@ def test_candidates_have_the_certified_values_that_were_stated(problem, simulate
     )
 
 
+@pytest.mark.slow
 def test_files_of_every_kind_can_be_imported(paper_arm, tmp_path):
     """The manifest of a plan reads files that hold what it says: readings, and what was measured."""
     capture = aj.simulate(paper_arm, {}, observations=EVERYTHING, noise=aj.Noise(), seed=2)
@@ -174,6 +175,7 @@ def test_least_poses():
     np.testing.assert_array_equal(least_poses([bar, sphere, plane]), [3, 3, 5, 4])
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("kit", "options", "text"),
     [
@@ -195,6 +197,7 @@ def bar(**options):
     return KitItem(simulated, **options)
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("item", "options", "text"),
     [
@@ -219,6 +222,7 @@ def test_what_cannot_be_reached_says_why(paper_arm, space, monkeypatch, item, op
     assert text in str(refused.value)
 
 
+@pytest.mark.slow
 def test_a_kit_that_leaves_parameters_open(paper_arm):
     """Touches of one sphere say nothing of where the arm stands or of its first offset."""
     with pytest.raises(aj.InputError, match="this kit cannot determine all parameters"):

@@ -28,6 +28,7 @@ def magnification(plot):
     return float(plot.title.split()[1])
 
 
+@pytest.mark.slow
 def test_coverage_counts_every_corner(image):
     chart = cameras.coverage_chart(image)
     marks = chart.plots[0].marks[-1]
@@ -39,6 +40,7 @@ def test_coverage_counts_every_corner(image):
         assert marks.limits[shade] <= count < marks.limits[shade + 1]
 
 
+@pytest.mark.slow
 def test_residual_arrows_end_where_corners_were_seen(camera_record, image):
     chart = cameras.residual_chart(image)
     [plot] = chart.plots
@@ -52,6 +54,7 @@ def test_residual_arrows_end_where_corners_were_seen(camera_record, image):
     assert [row[0].text for row in chart.table.cells] == [f"images, pose {i + 1}" for i in range(12)]
 
 
+@pytest.mark.slow
 def test_far_residuals_have_a_tone_of_their_own(image):
     residuals = image.residuals.copy()
     residuals[5] = 40.0
@@ -61,6 +64,7 @@ def test_far_residuals_have_a_tone_of_their_own(image):
     assert starts == pytest.approx(image.corners[5:6] - 40.0)
 
 
+@pytest.mark.slow
 def test_pictures_go_from_the_largest_residuals_to_the_smallest(image):
     assert cameras.picture_charts(image) == []
     shown = image._replace(pictures=["", *(f"{i}" for i in range(1, 12))], refused=[("x", "13: it is too dark")])
@@ -77,6 +81,7 @@ def test_pictures_go_from_the_largest_residuals_to_the_smallest(image):
     assert (plot.picture, plot.title) == ("x", "13: it is too dark")
 
 
+@pytest.mark.slow
 def test_distortion_is_what_takes_ideal_pixels_to_distorted_ones(image):
     [plot] = cameras.distortion_chart(image).plots
     nodes, steps = arrows(plot.marks[1])
@@ -93,6 +98,7 @@ def test_distortion_is_what_takes_ideal_pixels_to_distorted_ones(image):
     assert cameras.distortion_chart(image._replace(intrinsics=image.intrinsics[:4])) is None
 
 
+@pytest.mark.slow
 def test_shapes_are_where_camera_and_target_are(camera_record, image):
     """The apex of the pyramid is the camera's centre, its corners appear at those of the image, and those of the
     outline among the corners that were seen."""
@@ -112,6 +118,7 @@ def test_shapes_are_where_camera_and_target_are(camera_record, image):
         assert corners == pytest.approx(seen.measured[pose][[0, 2, 5, 3]], abs=3.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["camera_coverage", "camera_residuals", "camera_distortion", "camera_poses"])
 def test_figures(camera_record, record_without_cameras, name):
     figure = getattr(aj.plot, name)

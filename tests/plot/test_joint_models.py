@@ -35,6 +35,7 @@ def records(capture, compared):
     ]
 
 
+@pytest.mark.slow
 def test_bars_of_compared_models(compared):
     axes = aj.plot.model_comparison(compared)
     inside, outside = ([bar.get_height() for bar in bars] for bars in axes.containers if len(bars) == 2 and bars[0])
@@ -44,6 +45,7 @@ def test_bars_of_compared_models(compared):
     axes.figure.savefig(io.BytesIO())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "joint"), [(0, 2), (0, 3), (1, 2), (1, 3)])
 def test_marks_and_curve_are_the_error_of_the_encoder(records, model, joint):
     """Of Denavit-Hartenberg alone the marks keep what its parameters cannot take up, most of the waves; of the right
@@ -66,5 +68,6 @@ def test_marks_and_curve_are_the_error_of_the_encoder(records, model, joint):
     assert np.sqrt(np.mean((marks.get_ydata() - expected) ** 2)) < 0.1
 
 
+@pytest.mark.slow
 def test_what_cannot_be_drawn(records):
     assert_refused(lambda: aj.plot.joint_function(records[0], 7), "joints 1 to 6")

@@ -57,6 +57,7 @@ FIGURES = [
 ]  # fmt: skip
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("unit", "count"), [("mm", 15 + 8 + 25 + 12 + 16 + 16), ("standard deviations", 92), ("deg", 25)]
 )
@@ -90,6 +91,7 @@ def test_figures_of_a_calibration_from_observations(observed_record, tmp_path):
     assert np.sqrt(np.mean(lines[1].get_ydata()[:15] ** 2)) == pytest.approx(observed_record.observed.rms_after[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FIGURES)
 def test_a_figure_draws_into_the_axes_it_is_given_or_into_new_ones(made, name, tmp_path):
     axes = Figure().subplots()
@@ -114,6 +116,7 @@ def test_figures_hold_the_numbers(record, made):
     np.testing.assert_allclose(values, made["singular_values"][0].singular)
 
 
+@pytest.mark.slow
 def test_patterns_in_the_residuals(record):
     """A panel for each joint, one for each axis, and the histogram; with the numbers of the calibration."""
     from aacmm_jax.diagnostics.pose_residuals import signed_residuals
@@ -133,6 +136,7 @@ def test_patterns_in_the_residuals(record):
     assert_refused(lambda: aj.plot.residual_patterns(alone), "there are no residuals to draw")
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     "name", ["pose_distances", "length_parameter_errors", "parameter_changes", "reference_length_errors"]
 )

@@ -1,11 +1,13 @@
 """Reports and figures of an arm whose readings end with a temperature."""
 
 import numpy as np
+import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.report import write_report
 
 
+@pytest.mark.slow
 def test_report_and_figure_have_joints_alone(paper_arm, tmp_path):
     arm = paper_arm.replace(thermometer=True)
     nominal = aj.files.load_specification("cheng2018-simulation")._replace(arm=arm)

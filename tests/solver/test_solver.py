@@ -38,6 +38,7 @@ def solve(problem):
     return solution.value, cost, stats["optimality"], aj.calibration.converged(stats["reason"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("third", "count"),
     [
@@ -137,6 +138,7 @@ def _by_steps(data):
 _COMPILED = ("BoxBOD", "MGH10")
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("solver", "name"),
     [
@@ -175,6 +177,7 @@ def test_pytrees_and_partial_bounds():
     assert boxed.stats["reason"] == aj.Reason.gradient
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("mode", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev])
 def test_derivative_follows_an_active_bound(mode):
     """With a on its bound u, the minimum is (u, u^2): d/du = (1, 2u) exactly, and nothing depends on the steepness."""
@@ -191,6 +194,7 @@ def test_derivative_follows_an_active_bound(mode):
     np.testing.assert_allclose(mode(optimum)(jnp.array(5.0), jnp.array(10.0)), [0, 0], atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "unit",
     [
@@ -235,6 +239,7 @@ FALSE_DERIVATIVES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", FALSE_DERIVATIVES)
 def test_a_false_jvp_is_not_called_converged(case):
     residual, factor, ends = FALSE_DERIVATIVES[case]
@@ -296,6 +301,7 @@ def test_crossed_bounds_are_refused():
         aj.least_squares(lambda y, _: y, jnp.array([1.0]), lower=2.0, upper=1.0)
 
 
+@pytest.mark.slow
 def test_solves_under_vmap_equal_single_solves():
     problems = [bounded_problems.draw(seed) for seed in range(0, 24, 3)]
     stacked = {key: jnp.stack([jnp.asarray(problem[key]) for problem in problems]) for key in problems[0]}

@@ -8,6 +8,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.study import configuration_pool, runner
+from tests.conftest import SLOW
 
 from . import prepared_blocks
 from .small_study import CHUNK, SPECIFICATION
@@ -32,18 +33,24 @@ def pools_built_once():
 
 
 @pytest.fixture(scope="session")
-def home(tmp_path_factory) -> Path:
-    """A folder with the specification, and the study run through at once."""
+def begun_home(tmp_path_factory) -> Path:
+    """A folder with the specification."""
     folder = tmp_path_factory.mktemp("study")
     (folder / "spec.toml").write_text(SPECIFICATION)
-    outcome = aj.study.run_study(aj.study.read_study(folder / "spec.toml"), folder / "whole.h5", chunk=CHUNK)
-    assert outcome.finished
     return folder
 
 
+@pytest.fixture(scope="session", params=SLOW)
+def home(begun_home) -> Path:
+    """The same with the study run through at once."""
+    study = aj.study.read_study(begun_home / "spec.toml")
+    assert aj.study.run_study(study, begun_home / "whole.h5", chunk=CHUNK).finished
+    return begun_home
+
+
 @pytest.fixture
-def study(home):
-    return aj.study.read_study(home / "spec.toml")
+def study(begun_home):
+    return aj.study.read_study(begun_home / "spec.toml")
 
 
 @pytest.fixture

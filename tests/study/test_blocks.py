@@ -53,6 +53,7 @@ def test_the_difference_is_named(case):
             check_same(begun, "s.h5", "choose another output path")
 
 
+@pytest.mark.slow
 def test_what_was_begun_otherwise_is_read_but_not_continued(study, tmp_path):
     settings = json.dumps(json.loads(computed_with()) | {"XLA_FLAGS": "--xla_a=1"}, sort_keys=True)
     message = r"s\.h5 was begun with XLA_FLAGS=--xla_a=1, but this process has no XLA_FLAGS"
@@ -80,6 +81,7 @@ def test_a_worker_with_other_settings_computes_nothing(study, monkeypatch):
         runner._run(study, settings, block, None)
 
 
+@pytest.mark.slow
 def test_the_file_says_what_it_was_computed_with(home):
     with h5py.File(home / "whole.h5") as file:
         kept = json.loads(file.attrs["computed_with"])

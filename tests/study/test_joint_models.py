@@ -27,6 +27,7 @@ def study(deviation=FAULT, capture=CAPTURE, reference=REFERENCE, **tables):
     return make_study(capture=capture, deviation=DEVIATION | deviation, **tables)
 
 
+@pytest.mark.slow
 def test_what_a_cell_identifies():
     """Models of true arms and of cells are factors; a model has the default prior, and is solved jointly with it."""
     made = study(identification={"model": ["dh", "harmonics=1"], "prior": ["none", "harmonics=5arcsec"]})
@@ -88,6 +89,7 @@ MESSAGES = {
 }
 
 
+@pytest.mark.first_rows(4)
 @pytest.mark.parametrize("case", MESSAGES)
 def test_refused(case):
     deviation, identification, message = MESSAGES[case]
@@ -95,6 +97,7 @@ def test_refused(case):
         study(deviation, identification=identification)
 
 
+@pytest.mark.slow
 def test_readings_are_those_of_the_corrected_joints(paper_arm):
     """By three arms at once: with its corrections each has its tip where the plain one has it at other readings."""
     arm = with_corrections(paper_arm, "harmonics=1-4,gear,gravity")
@@ -112,6 +115,7 @@ def test_readings_are_those_of_the_corrected_joints(paper_arm):
         np.testing.assert_allclose(tips, paper_arm.position(q[:, i].T), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_poses_of_a_recording_are_taken_by_the_corrected_arm(paper_arm):
     """A tracker sees the tips of the true arm, but for its noise, where the recording had them; without compiling."""
     box = [[200, -300, 100], [600, 300, 500]]

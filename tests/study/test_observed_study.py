@@ -66,6 +66,7 @@ def test_trials_scatter_as_a_calibration_says(paper_arm, held, capture):
         np.testing.assert_allclose(values, found[name][:, 20:29], rtol=1e-9, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "which", [slice(3, 4), pytest.param(slice(None), marks=pytest.mark.exhaustive)], ids=["sphere", "all"]
 )

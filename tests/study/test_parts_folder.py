@@ -58,6 +58,7 @@ PLANTED = {
 }
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("case", [case if case in OURS else pytest.param(case, marks=root) for case in PLANTED])
 def test_what_others_could_have_written_is_refused(case, home, study, tmp_path):
     plant, running, reading = PLANTED[case]
@@ -86,6 +87,7 @@ def test_nobody_else_may_write_into_a_new_folder(study, tmp_path, umask):
     assert parts_of(tmp_path / "s.h5").stat().st_mode & 0o777 == 0o755 & ~umask
 
 
+@pytest.mark.slow
 def test_nobody_else_may_change_a_block(home, study, tmp_path):
     former = os.umask(0)
     try:
@@ -95,6 +97,7 @@ def test_nobody_else_may_change_a_block(home, study, tmp_path):
     assert {block.stat().st_mode & 0o777 for block in parts_of(tmp_path / "s.h5").iterdir()} == {0o644}
 
 
+@pytest.mark.slow
 def test_a_file_system_without_owners_is_a_warning(home, study, tmp_path, monkeypatch):
     """As shares and drives of other systems, which show all files alike."""
     path = tmp_path / "s.h5"

@@ -10,7 +10,9 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.study.results import distribution, statistic
 from aacmm_jax.study.tables import level_title
+from tests.conftest import SLOW
 from tests.refusals import assert_refused
+from tests.written_study import write_study
 
 from .small_study import CHUNK, NOISE, REFERENCE, begun, made
 
@@ -19,8 +21,8 @@ TRIALS = 24
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory):
-    study = made(
+def small():
+    return made(
         name="a study",
         trials=TRIALS,
         seed=5,
@@ -28,11 +30,24 @@ def path(tmp_path_factory):
         reference=REFERENCE | {"u_mm": 0.002},
         bounds={"length_mm": [0.5, 5], "length_shift_mm": [0, 1]},
     )
+
+
+@pytest.fixture(scope="module")
+def path(small, tmp_path_factory):
+    """Of results that were drawn."""
     path = tmp_path_factory.mktemp("results") / "study.h5"
-    aj.study.run_study(study, path, chunk=CHUNK)
+    write_study(path, small)
     return path
 
 
+@pytest.fixture(scope="module", params=SLOW)
+def computed(small, tmp_path_factory):
+    path = tmp_path_factory.mktemp("computed") / "study.h5"
+    aj.study.run_study(small, path, chunk=CHUNK)
+    return path
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("value", "names", "says"),
     [
@@ -73,8 +88,8 @@ def test_percentiles_are_numpys():
 
 
 @pytest.fixture(scope="module")
-def summary(path):
-    return aj.study.study_summary(aj.study.Results.of(path))
+def summary(computed):
+    return aj.study.study_summary(aj.study.Results.of(computed))
 
 
 STATISTICS = {
@@ -85,6 +100,7 @@ STATISTICS = {
 }
 
 
+@pytest.mark.first_rows(5)
 @pytest.mark.parametrize("name", STATISTICS)
 @pytest.mark.parametrize("count", [200, 1000, 6400])
 def test_standard_errors_are_those_of_theory(name, count):
@@ -107,6 +123,7 @@ def test_standard_errors_hold_what_a_group_shares():
     assert np.mean(found) == pytest.approx((1 / 6400 + 0.09 / 32) ** 0.5, rel=0.1)
 
 
+@pytest.mark.first_rows(3)
 @pytest.mark.parametrize("name", STATISTICS)
 @pytest.mark.parametrize("count", [640, 6400])
 def test_standard_errors_where_groups_differ_are_those_of_repetition(name, count):
@@ -119,6 +136,7 @@ def test_standard_errors_where_groups_differ_are_those_of_repetition(name, count
     )
 
 
+@pytest.mark.slow
 def test_boxes_say_what_is_pooled(path):
     title = aj.plot.study_distributions(aj.study.Results.of(path), "bounds.length_mm").get_suptitle()
     assert title.endswith("trials pooled over all levels of: shift of the centre, lengths [mm]")
@@ -138,8 +156,9 @@ def test_factors_are_named_in_words(name, level, text):
     assert level_title(name, level) == text
 
 
-def test_summary_says_what_the_arrays_say(path, summary):
-    data = aj.study.open_study(path)
+@pytest.mark.slow
+def test_summary_says_what_the_arrays_say(computed, summary):
+    data = aj.study.open_study(computed)
     assert summary["factors"] == {"bounds.length_mm": [0.5, 5.0], "bounds.length_shift_mm": [0.0, 1.0]}
     assert summary["trials_run"] == 4 * TRIALS
     cell = summary["results"][3]
@@ -161,6 +180,7 @@ def test_summary_says_what_the_arrays_say(path, summary):
     assert cell["converged"] == {"value": 1, "se": None}  # no scatter seen is not certainty
 
 
+@pytest.mark.slow
 def test_the_method_is_right(summary):
     """Within wide bounds the scale fix leaves no bias, and every parameter's bias is within its standard error."""
     cell = summary["results"][2]
@@ -173,6 +193,7 @@ def test_the_method_is_right(summary):
     )
 
 
+@pytest.mark.slow
 def test_labelled_data(path):
     data = aj.study.open_study(path)
     assert data.estimate.dims == ("cell", "trial", "parameter")
@@ -189,12 +210,14 @@ def test_levels_that_differ_little_are_told_apart():
     assert study.factors == {"capture.positions_mm": ["((400, 200, 300))", "((400.0001, 200, 300))"]}
 
 
+@pytest.mark.slow
 def test_a_study_that_has_just_begun_is_shown(aacmm, study, tmp_path):
     begun(tmp_path / "s.h5", study, 1000)
     assert "No trial has ended yet" in aacmm("show", "s.h5", "--figures", "f").stdout
     assert "No trial has ended yet" in aacmm("show", "s.h5", "--cell", 3).stdout
 
 
+@pytest.mark.slow
 def test_the_terminal_shows_all_of_it(path, aacmm):
     done = aacmm("show", path)
     assert f"a study of Cheng 2018, simulated arm: 4 cells of {TRIALS} trials, seed 5" in done.stdout
@@ -221,6 +244,7 @@ def test_every_figure_is_drawn(path, aacmm, tmp_path):
     }
 
 
+@pytest.mark.first_rows(9)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

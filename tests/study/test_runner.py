@@ -126,6 +126,7 @@ def test_an_executor_that_forks_is_refused(study, tmp_path):
         aj.study.run_study(study, tmp_path / "t.h5", executor=pool)
 
 
+@pytest.mark.slow
 def test_nobody_answers(aacmm, home, monkeypatch):
     distributed = pytest.importorskip("distributed")
     client = distributed.Client

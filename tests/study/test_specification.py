@@ -54,6 +54,7 @@ def test_a_recorded_capture_takes_any_method(noisy_capture, paper_arm):
     assert [setting.method for setting in study.settings] == ["two-stage", "joint"]
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("name", aj.study.shipped_studies())
 def test_shipped_studies_are_read(name):
     study = aj.study.read_study(name)
@@ -67,6 +68,7 @@ def _text(name: str) -> str:
     return (resources.files("aacmm_jax.study") / "shipped_studies" / f"{name}.toml").read_text()
 
 
+@pytest.mark.slow
 def test_what_a_toml_file_names_is_in_its_folder(tmp_path, noisy_capture, paper_arm):
     aj.files.save_arm(paper_arm, tmp_path / "my-arm.toml", name="mine")
     specification = aj.files.load_specification("cheng2018-simulation")
@@ -78,6 +80,7 @@ def test_what_a_toml_file_names_is_in_its_folder(tmp_path, noisy_capture, paper_
     assert study.settings[0].method == "two-stage"
 
 
+@pytest.mark.first_rows(11)
 @pytest.mark.parametrize(
     ("tables", "message"),
     [
@@ -157,6 +160,7 @@ def test_a_narrow_region_is_found(tmp_path):
         assert aj.study.run_study(study, tmp_path / f"{seed}.h5").finished
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("tables", "message"),
     [

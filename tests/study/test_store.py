@@ -21,6 +21,7 @@ from aacmm_jax.study.store import parts_of
 from .small_study import CHUNK, ROOT, begun, command, interrupted_at, same, until_parts, written_in_blocks
 
 
+@pytest.mark.slow
 @pytest.mark.optimised
 @pytest.mark.parametrize(
     ("chunk", "trials"),
@@ -61,6 +62,7 @@ def test_cells_of_different_settings_share_no_block():
     assert [block.shape for block in blocks_of(widths, 1000)] == [(6, 10)] * 2
 
 
+@pytest.mark.slow
 def test_stopped_is_resumed(home, study, tmp_path):
     """Stopped by its callback: all finished blocks are kept, read while unfinished, and continued."""
     path = tmp_path / "s.h5"
@@ -80,6 +82,7 @@ def test_stopped_is_resumed(home, study, tmp_path):
     assert aj.study.run_study(study, path).ran == 0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("read_blocks")
 def test_a_second_run_at_the_same_time_is_refused(study, tmp_path):
     refused = []
@@ -95,6 +98,7 @@ def test_a_second_run_at_the_same_time_is_refused(study, tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["s.h5"]
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -132,6 +136,7 @@ def test_other_files_are_not_overwritten(study, tmp_path, noisy_capture):
     aj.files.load_capture(tmp_path / "c.h5")
 
 
+@pytest.mark.slow
 def test_results_without_their_parts_are_missed(home, study, tmp_path):
     path = tmp_path / "s.h5"
     begun(path, study, 16)
@@ -178,6 +183,7 @@ def test_a_moved_and_oddly_named_study_still_reads(home, study, tmp_path):
     same(home / "whole.h5", moved / path.name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "computed", [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.exhaustive)]
 )
@@ -275,6 +281,7 @@ def test_the_number_of_devices_changes_nothing(home, tmp_path):
             )
 
 
+@pytest.mark.slow
 def test_results_in_blocks_are_those_in_the_file(home, study, tmp_path):
     path = tmp_path / "s.h5"
     written_in_blocks(home, study, path, CHUNK)
@@ -313,6 +320,7 @@ def test_a_spoilt_block_runs_again(home, study, tmp_path):
     same(home / "whole.h5", path)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("read_blocks")
 def test_a_worker_that_fails_stops_the_study_and_keeps_the_rest(study, tmp_path, monkeypatch):
     real = runner.run_block

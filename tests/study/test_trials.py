@@ -33,6 +33,7 @@ def hayati() -> "aj.Arm":
     return aj.Arm(alpha=panda.alpha, a=panda.a, d=panda.d, theta=panda.theta, probe=panda.probe, beta=0.01 * np.ones(7))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arm", "deviation"),
     [
@@ -101,6 +102,7 @@ def test_no_pose_twice_and_all_within_the_limits():
     assert not first & second
 
 
+@pytest.mark.slow
 def test_no_row_of_the_pool_is_chosen_twice():
     """Most of a small pool: 70 of the 128 poses of each part."""
     static = trial_simulation._Static(((0, 1, 1, 128, 70),), (), (), False, None, False, False)
@@ -114,6 +116,7 @@ def test_no_row_of_the_pool_is_chosen_twice():
             assert set(rows // 128) == {trial % 32}
 
 
+@pytest.mark.slow
 def test_deviations_have_their_distributions():
     study = made(deviation={"length_mm": 1.0, "d_mm": {"normal": 0.3}, "angle_deg": 0.1, "theta_deg": 0.0})
     trials = drawn(study, 2048)
@@ -131,6 +134,7 @@ def test_deviations_have_their_distributions():
     assert np.abs(correlation - np.eye(15)).max() < 0.08
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "part",
     ["encoder_arcsec", "seating_mm", "resolution_arcsec", pytest.param("eccentricity_arcsec", marks=pytest.mark.slow)],
@@ -163,6 +167,7 @@ def test_noise_is_what_was_asked(part):
         assert np.std(parts) == pytest.approx(5 * ARCSEC, rel=0.2)
 
 
+@pytest.mark.slow
 def test_reference_lengths_err_by_their_u():
     study = made(reference=REFERENCE)
     trials = drawn(study, 1024)
@@ -221,6 +226,7 @@ def whole(request):
     return study, count, run_block(study, Block(0, 2, 0, count))
 
 
+@pytest.mark.slow
 @pytest.mark.optimised
 def test_equals_one_by_one(whole):
     study, _, results = whole
@@ -253,6 +259,7 @@ def test_equals_one_by_one(whole):
         assert results[there][1, i] == pytest.approx(error, abs=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.optimised
 def test_a_trial_depends_on_its_key_alone(whole):
     """To the bit, whatever block a trial is in."""

@@ -10,6 +10,7 @@ FIRST = np.array([[0.0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1]])
 LINK = (1.0, 2.0, 3.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("follows", [True, False])
 def test_of_an_arm_from_a_urdf_mounts_are_in_its_tip_link_and_places_in_its_base_link(camera_record, follows):
     [before] = camera_rows(camera_record)

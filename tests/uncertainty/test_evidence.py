@@ -127,6 +127,7 @@ def test_elimination_is_the_marginal():
     np.testing.assert_allclose(model.right, marginal @ [0.5, -1.0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_same_under_jit_and_vmap():
     models, members = [random_model(seed) for seed in range(3)], np.repeat(np.eye(2), 3, axis=1)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)
@@ -135,6 +136,7 @@ def test_the_same_under_jit_and_vmap():
     np.testing.assert_allclose(many, one, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_of_effective_parameters():
     model = random_model(0)
 

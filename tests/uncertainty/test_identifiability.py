@@ -48,6 +48,7 @@ RANKS = {
 }
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("noise", [None, aj.Noise(encoder_arcsec=2.0, seating=0.005)], ids=["plain", "whitened"])
 @pytest.mark.parametrize("case", RANKS)
 def test_rank_and_null_space_of_the_paper(paper_arm, single, paper_capture, case, noise):
@@ -74,6 +75,7 @@ def test_directions_move_nothing(paper_arm, single):
         assert np.abs(tips - tips.mean(axis=0)).max() < 1e-6  # of steps of 1e-3 mm and 1e-6 rad, to second order
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("positions", "rank"), [(1, 19), pytest.param(2, 21, marks=pytest.mark.slow)])
 def test_lengths_alone(paper_arm, positions, rank):
     seen = aj.observability(paper_arm, pairs(paper_arm, ENDS[:positions]))
@@ -120,6 +122,7 @@ def test_what_few_poses_need(paper_arm, paper_capture):
     assert "More poses in a socket" in sentence
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("lengths", [0, 1])
 def test_independent_parameters_are_the_papers(paper_arm, single, paper_capture, lengths):
     """With a length the 21; without, the longest link is fixed too. All are determined, none could be added."""
@@ -130,6 +133,7 @@ def test_independent_parameters_are_the_papers(paper_arm, single, paper_capture,
     assert aj.observability(paper_arm, capture, chosen).rank == len(chosen.names)
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("sockets", "certified", "target", "fixed"),
     [

@@ -53,6 +53,7 @@ def test_imitation_is_what_a_finite_step_shows(panda, capture):
         assert trade_off.movement < 0.001
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("off_axis", [0.0, 0.6, 50.0])
 def test_size_decides(off_axis):
     """With a probe far off the last axis, joint 6 is determined; on the axis it is not."""
@@ -81,6 +82,7 @@ def test_shipped_arms_are_what_independent_chooses():
         assert aj.Parameters.independent(specification.arm).names == specification.space().names, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["two-stage", pytest.param("joint", marks=pytest.mark.slow)])
 def test_a_bound_that_ends_such_a_direction_is_part_of_u(panda, capture, method):
     """The arm is right but for 2 mm of a_6, so theta_6 goes to its bound; a_6 and theta_6 must not pass as exactly

@@ -53,6 +53,7 @@ CASES = {
 }
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("case", "noise"),
     [
@@ -93,6 +94,7 @@ def test_a_target_takes_the_place_of_the_probe(paper_arm):
     }
 
 
+@pytest.mark.slow
 def test_transforms_that_an_arm_of_five_joints_cannot_take():
     """An arm that is not yet calibrated reaches none of them exactly, and still all that is free is determined."""
     arm, random = to_numpy(aj.load_arm("so100")), np.random.default_rng(0)
@@ -160,6 +162,7 @@ def test_lengths_of_measured_sockets_weigh_as_their_poses_scatter(paper_arm):
     np.testing.assert_allclose(by_sigma, agreeing.eliminated().relations / (0.01 * np.sqrt(2 / 20)), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_calibrate_warns_of_what_observations_leave_open(paper_arm):
     simulated = kinds.SimulatedPoints("T", BOX, 60, FRAME, u=0.01)
     capture = aj.simulate(paper_arm, {}, observations=[simulated], noise=NOISE, seed=3)

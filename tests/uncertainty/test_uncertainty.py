@@ -47,6 +47,7 @@ def result(paper_arm, capture, bounds) -> aj.Calibration:
     return aj.calibrate(paper_arm, capture, bounds, method="joint", noise=NOISE, shared_errors=False)
 
 
+@pytest.mark.slow
 def test_small_inverse_roots_are_those_of_cholesky():
     random = np.random.default_rng(0)
     for size in (1, 2, 3):
@@ -57,6 +58,7 @@ def test_small_inverse_roots_are_those_of_cholesky():
         np.testing.assert_allclose(inverse_cholesky(jnp.asarray(matrices)), expected, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_weighted_solve_is_the_dense_generalised_least_squares(paper_arm, space, bounds, capture, result):
     """At the solution the gradient of the textbook's objective, sockets as unknowns, is zero; its curvature is the
     covariance."""
@@ -88,6 +90,7 @@ def test_weighted_solve_is_the_dense_generalised_least_squares(paper_arm, space,
     np.testing.assert_allclose(result.covariance / np.outer(u, u), covariance / np.outer(u, u), atol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "noise"),
     [pytest.param("two-stage", None, id="even"), pytest.param("joint", UNEVEN, id="weighted", marks=pytest.mark.slow)],
@@ -145,6 +148,7 @@ def test_many_weighted_calibrations_equal_single_ones(paper_arm, bounds, capture
 
 
 # Least share of the worst parameter; a share of 95 % of 400 scatters by 1.1 %: 3.8 of it for the worst of 21.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("trials", "noise", "noise_model", "least", "most"),
     [
@@ -185,6 +189,7 @@ def test_coverage(paper_arm, space, bounds, trials, noise, noise_model, least, m
         assert 0.953 - width < share.mean() < 0.953 + width
 
 
+@pytest.mark.slow
 def test_tips_and_lengths(paper_arm, space, result):
     """Covariances of functions are those of their derivatives, found by JAX without the package's formulas."""
     uncertainty = aj.uncertainty_of(result)
@@ -202,6 +207,7 @@ def test_tips_and_lengths(paper_arm, space, result):
     assert float(uncertainty.length(q[0], q[1], reading=True)) > float(uncertainty.length(q[0], q[1]))
 
 
+@pytest.mark.slow
 def test_over_the_volume(result):
     uncertainty = aj.uncertainty_of(result)
     volume = aj.volumetric_uncertainty(uncertainty, points=50, length=250.0)
@@ -215,6 +221,7 @@ def test_over_the_volume(result):
             aj.volumetric_uncertainty(uncertainty, **wrong)
 
 
+@pytest.mark.slow
 def test_near_poses_lengths_begin_and_end_near_to_them(result, capture):
     """A and B are 200 mm apart: lengths of 210 mm between them end 10 mm from a pose."""
     uncertainty, q = aj.uncertainty_of(result), np.asarray(capture.q)
@@ -230,6 +237,7 @@ def test_near_poses_lengths_begin_and_end_near_to_them(result, capture):
         aj.volumetric_uncertainty(uncertainty, length=210.0, near=capture.sockets["A"])
 
 
+@pytest.mark.slow
 def test_what_is_open_has_no_uncertainty(paper_arm, capture):
     """With alpha_6 and d_6 both free neither is determined; the tip is, and so are lengths. Without a length the scale
     is open."""
@@ -286,6 +294,7 @@ def test_estimated_noise_is_that_of_the_simulation(paper_arm, bounds):
     assert np.all(np.abs(mean - [16.0, 1e-4]) < 4 * error)
 
 
+@pytest.mark.slow
 def test_reduced_chi_shows_that_the_noise_is_wrong(paper_arm, capture, bounds):
     right = aj.calibrate(paper_arm, capture, bounds, noise=NOISE)
     wrong = aj.calibrate(paper_arm, capture, bounds, noise=aj.Noise(encoder_arcsec=1.0, seating=0.0025))
@@ -326,6 +335,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("case", REFUSED)
 def test_refused(paper_arm, capture, bounds, case):
     ask, text = REFUSED[case]
@@ -333,6 +343,7 @@ def test_refused(paper_arm, capture, bounds, case):
         ask(paper_arm, capture, bounds)
 
 
+@pytest.mark.slow
 def test_the_working_volume_has_the_u_of_its_lengths(result):
     """One by one, with the coverage factor of each."""
     uncertainty = aj.uncertainty_of(result)

@@ -52,6 +52,7 @@ def test_an_identification_keeps_the_table(tmp_path):
     assert float(aj.load_arm(path).d[1]) == 439_140.974079901
 
 
+@pytest.mark.slow
 def test_such_a_table_is_calibrated_and_exported(tmp_path):
     nominal = aj.load_arm(file(tmp_path, PARAMETERS))
     space = aj.Parameters.independent(nominal)
@@ -69,6 +70,7 @@ def test_such_a_table_is_calibrated_and_exported(tmp_path):
     np.testing.assert_allclose(again.pose(Q), result.arm.pose(Q), rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_origins_of_a_published_table(tmp_path):
     """UR10e by the maker's nominal table (universal-robots.com, DH parameters): the origins by hand, m and rad."""
     right = np.pi / 2

@@ -75,6 +75,7 @@ TABLES = {
 }
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("name", WRITERS)
 def test_every_format_gives_the_same_observation(tmp_path, name):
     WRITERS[name](tmp_path / name, Q, POINTS)

@@ -25,6 +25,7 @@ def read(folder, path, table, more=""):
     return aj.files.read_manifest(folder / "capture.toml")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tracker", TRACKED)
 @pytest.mark.parametrize("kind", KINDS)
 def test_poses_are_matched_with_the_tracker(tmp_path, kind, tracker):
@@ -41,6 +42,7 @@ def test_poses_are_matched_with_the_tracker(tmp_path, kind, tracker):
     assert note == f"{path.name}: 5 poses in which the arm stood still, 5 of them with {where}"
 
 
+@pytest.mark.slow
 def test_u_is_the_standard_deviation_of_the_mean(tmp_path):
     path, _ = record(tmp_path, "mcap", "ur10e", POSES, noise=1e-4)
     (seen,) = read(
@@ -51,6 +53,7 @@ def test_u_is_the_standard_deviation_of_the_mean(tmp_path):
     assert np.median(u) == pytest.approx(0.1 / np.sqrt(count), rel=0.3)
 
 
+@pytest.mark.slow
 def test_sockets_need_joint_states_only(tmp_path):
     path, _ = record(tmp_path, "sqlite3", "ur10e", POSES, tracker="none")
     recording = read(tmp_path, path, "[[socket]]\n")
@@ -65,6 +68,7 @@ def test_a_single_file_of_a_recording_is_enough(tmp_path):
     assert TextTable(path / "session.mcap").length == len(POSES)
 
 
+@pytest.mark.slow
 def test_several_trackers_are_named(tmp_path):
     def second(bag, t, q):
         for time in t[::5]:
@@ -110,6 +114,7 @@ def corner_files(kind, folder, board, camera, arm_name):
     return path, seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["rosbag1", "mcap"])
 def test_corners_of_tags_are_pixels(tmp_path, kind):
     board = aj.camera.target_of("tags", tags=[3, 2], size=30.0, gap=9.0, dictionary="apriltag_36h11")
@@ -164,6 +169,7 @@ def calibration_data(folder, kind, sensors):
     return bag.path, points
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_robot_calibration_has_poses_and_points(tmp_path, kind):
     path, points = calibration_data(tmp_path, kind, {"camera": 12, "led": 1})
@@ -220,6 +226,7 @@ REFUSED = {
 }  # fmt: skip
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_is_missing_is_one_sentence(tmp_path, case):
     make, options, parts = REFUSED[case]
@@ -241,6 +248,7 @@ def test_messages_without_a_time_have_that_of_the_recorder(tmp_path):
     assert TextTable(path).note.endswith("5 of them with /plain")
 
 
+@pytest.mark.slow
 def test_a_definition_in_a_recording_cannot_run_code(tmp_path):
     """rosbags makes Python code of definitions, with the names in them."""
     path, _ = corner_files("mcap", tmp_path, aj.camera.target_of("tags", tags=[3, 2], size=30.0, gap=9.0,
