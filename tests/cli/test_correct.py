@@ -178,15 +178,17 @@ def test_columns_of_other_names_and_positions_in_metres(arms):
     np.testing.assert_allclose(found, np.array(corrected[:2], dtype=float), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_positions_are_of_the_tip_or_of_a_target_by_its_name(tmp_path):
     """The offset of the target was found by the calibration, and is not the tip of the arm."""
     command_line(tmp_path, "calibrate", ROBOT, "-o", "robot.h5", "--model", "dh", "--no-automatic")
     record = aj.files.load_calibration(tmp_path / "robot.h5")
     (target,) = (np.asarray(at) for name, at in record.observed.geometry.items() if name == "offset of ball")
     nominal, calibrated = record.recording.nominal.arm, record.calibrated.arm
-    points = np.asarray(nominal.position(Q[:1] + 0.02 * np.arange(3)[:, None]))
+    q = DEG * np.array([10, 30, 70, 10, 60, 0]) + 0.02 * np.arange(3)[:, None]
+    points = np.asarray(nominal.position(q)) + np.asarray(target) / 2
     write(tmp_path / "points.csv", ["x", "y", "z"], points)
-    near = f"--near={','.join(str(x) for x in Q[0] / DEG)}"
+    near = f"--near={','.join(str(x) for x in q[0] / DEG)}"
     for options, tip in (((), (0, 0, 0)), (("--probe", "ball"), target)):
         command = ("correct", "robot.h5", "points.csv", "-o", "out.csv", "--unit", "deg", near, *options, "--json")
         summary = json.loads(command_line(tmp_path, *command, "--overwrite").stdout)
