@@ -138,12 +138,13 @@ def main() -> None:
     parser.add_argument("--only", choices=PARTS, action="append", help="parts to run; all by default")
     parser.add_argument("--rows", default="", help="compute only the rows whose name contains this text")
     given = parser.parse_args()
-    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     for part in given.only or PARTS:
         for name, computed in PARTS[part]().items():
             if given.rows in name:
-                results.setdefault(part, {})[name] = row = computed()
+                row = computed()
                 print(name, row, flush=True)
+                results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}  # now: others may run beside this
+                results.setdefault(part, {})[name] = row
                 RESULTS.write_text(json.dumps(results, indent=1) + "\n")
 
 

@@ -2,8 +2,9 @@
 
 `python benchmarks/planned_poses.py` (two minutes of CPU) writes results/planned_poses.json; docs/figures.py draws it.
 The arm is the simulated one of Cheng et al. 2018, with 2 arcsec and 5 um of noise, in four sockets with two reference
-lengths (u = 2 um) where a plan of 25 poses places them; lengths of 300 mm over the volume. Random poses are uniform in
-the joints and moved to the sockets; the median of sets of them is given.
+lengths (u = 2 um) where a plan of 25 poses places them, 20 to 1000 mm above the table, with the tool at most 55 deg
+from the vertical; lengths of 300 mm over the volume. Random poses are uniform in the joints and moved to the sockets;
+the median of sets of them is given.
 """
 
 import json
@@ -25,9 +26,9 @@ def curves(sockets: int, seed: int) -> dict:
     options = {
         "noise": small_arm_noise(),
         "seed": seed,
-        "above": -math.inf,
         "check_length": 300.0,
         "candidates": CANDIDATES,
+        "cone": aj.kinematics.Cone(math.radians(55)),
     }
     placed = aj.planning.plan(arm, sockets=sockets, poses=25, **options)
     lengths = [(length.start, length.end) for length in placed.lengths]

@@ -22,7 +22,7 @@ import aacmm_jax as aj, numpy as np
 arm = aj.load_arm("cheng2018-simulation"); space = aj.Parameters.free_of(arm); bounds = aj.Bounds.around(arm, space)
 capture = aj.simulate(arm, sockets={"A": (400, 200, 300)}, poses=70, encoder_arcsec=2.0, seed=0)
 starts = np.random.default_rng(0).uniform(bounds.lower, bounds.upper, (1000, len(space.names)))
-aj.identify_many(arm, capture, bounds.lower, bounds.upper, starts, hold="d_3").de.block_until_ready()
+aj.identify_many(arm, capture, bounds.lower, bounds.upper, starts, hold="d_3")
 """
 POSITION = "import aacmm_jax as aj; aj.load_arm('panda').position([0.0] * 7)"
 WAITS = {

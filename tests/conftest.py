@@ -1,6 +1,7 @@
 """Strictness for all tests: shapes checked at run time, no silent promotion of rank or dtype; and common fixtures.
 
-`make test-slow` leaves the checks of types, which take a tenth of the time, to the others (AACMM_TYPES=0).
+`make test-slow` leaves the checks of types, which take a tenth of the time, to `make test` and `make test-exhaustive`
+(AACMM_TYPES=0).
 """
 
 import collections

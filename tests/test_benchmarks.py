@@ -64,6 +64,7 @@ def test_intervals_from_few_placements_hold(placements, most):
     assert np.mean(np.abs(found.errors) <= 1.96 * found.u) < found.inside
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("seed", range(6))
 def test_geometry_is_found_from_any_start(seed):
     """A few of the benchmark's 300 trials: any frame and offset, 10 to 2,000 points, 6 and 7 joints."""

@@ -55,7 +55,7 @@ def test_a_missing_extra_is_one_sentence_in_python(module, extra, use, monkeypat
         use()
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "extra", "arguments"),
     [

@@ -169,6 +169,12 @@ def _core(administrative_data: AdministrativeData, day: datetime.date) -> Elemen
         element("endPerformanceDate", end.isoformat()),
         element("performanceLocation", given.place),
         optional("issueDate", given.issued and given.issued.isoformat()),
+        given.replaces
+        and element(
+            "reportAmendedSubstituted",
+            element("typeOfChange", "substituted"),
+            element("replacedUniqueIdentifier", given.replaces),
+        ),
     )
 
 

@@ -1,23 +1,31 @@
 """The measurement results of a certificate: the same readings by the nominal and by the calibrated parameters."""
 
+import contextlib
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from xml.etree.ElementTree import Element
 
 import numpy as np
+from scipy.spatial.distance import pdist
 
 from ..calibration.evaluation import Evaluation
+from ..calibration.pose_table import HELD_OUT
 from ..calibration.record import CalibrationRecord, uncertainty_of
+from ..core.errors import InputError
 from ..data.capture import ReferenceLength
 from ..data.observations.observation import Quantity, certified_quantities
+from ..data.observations.pixels import Pixels
 from ..diagnostics.pose_residuals import ObservationResiduals, distances_of, observation_residuals, rms
 from ..files.administrative_data import NOT_STATED, AdministrativeData, Reference
 from ..kinematics.arm import parameter_names, parameter_unit
 from ..kinematics.parameters import Parameters
+from ..pipeline.hold_out import residuals_of
 from ..summaries.calibration import metrics_by_socket_and_length, prior_rows, prior_sentence
-from ..summaries.observations import less_weight
+from ..summaries.observations import distances_row, less_weight
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.coverage import LEVEL, LEVEL_IN_PERCENT
+from ..uncertainty.volume import volumetric_uncertainty
 from . import xml_elements as xml
 from .xml_elements import MILLIMETRE, ONE, RADIAN, element, english, named, real, text
 
@@ -43,6 +51,13 @@ _D_SI = {
     "K": r"\kelvin",
     "px": ONE,
 }  # D-SI has no pixel
+_STATISTICS = {"median": "median", "95": "95th percentile", "largest": "largest"}
+_OVER_VOLUME = {"Tip position": "expanded_tip", "Measured length": "expanded_length_reading"}
+_HELD_OUT = {
+    "rms_mm": "RMS distance",
+    "largest_mm": "largest distance",
+    "rms_predicted_mm": "RMS distance, predicted",
+}
 _MEASURED = {
     "mm": "standard uncertainty of a measured coordinate or distance",
     "rad": "standard uncertainty of a measured angle or orientation about each axis",
@@ -169,6 +184,8 @@ def _equipment(
         # As they were given.
         measured = [Quantity(_MEASURED[unit], np.array([u]), unit) for unit, u in part.u.items() if u]
         key = tuple((quantity.says, *np.asarray(quantity.values).tolist(), quantity.u) for quantity in certified)
+        if isinstance(observation, Pixels):
+            equipment[observation.board,] = ([observation.board], observation.kind, [_size(observation)])
         if certified or measured:
             where = (observation.kind, *(key if certified and not measured else (observation.name,)))
             names, _, _ = equipment.setdefault(where, ([], observation.kind, [*certified, *measured]))
@@ -190,6 +207,13 @@ def _equipment(
         )
 
 
+def _size(seen: Pixels) -> Quantity:
+    """The largest distance between points of a target that a camera sees, and the u of its scale there."""
+    size = pdist(np.unique(np.asarray(seen.points)[seen.seen], axis=0)).max(initial=0.0)
+    says = "distance between the points farthest apart"
+    return Quantity(says, np.array([float(f"{size:.7g}")]), "mm", float(f"{size * float(seen.u_scale):.2g}"))
+
+
 def _results(
     record: CalibrationRecord, stage: str, residuals: tuple[ObservationResiduals, ...]
 ) -> Iterator[Element | None]:
@@ -201,6 +225,16 @@ def _results(
             for name, value in values.items()
         )
         yield _result("Repeatability", "Computed over all sockets with more than one pose.", quantities)
+    if calibrated and record.held_out is not None:
+        row = distances_row(residuals_of(record).used_as(HELD_OUT))
+        values = [("poses", row["poses"], ONE), *((name, row[key], MILLIMETRE) for key, name in _HELD_OUT.items())]
+        quantities = (
+            named("quantity", name, real(value, unit, decimals=0 if unit == ONE else _DECIMALS[unit]))
+            for name, value, unit in values
+            if value is not None
+        )
+        says = "Distances of the tip from the geometry, in poses that the parameters were not identified from."
+        yield _result("Held-out poses", says, quantities)
     if record.recording.capture.lengths:
         yield _lengths(record, evaluation, calibrated, uncertainty)
     if not record.sockets_alone:
@@ -212,6 +246,7 @@ def _results(
         yield _result("Observations", "Distances of the tip from the geometry of each observation.", rows)
     yield _parameters(record, stage, uncertainty)
     if calibrated:
+        yield _volume(record, uncertainty)
         yield _covariance(record)
     if calibrated and not math.isnan(record.k):
         u = record.u_k if _is_known(record.u_k) else None
@@ -221,6 +256,28 @@ def _results(
             "Reference lengths as measured by the arm before its scale was set, divided by their calibrated values.",
             named("quantity", "k", k),
         )
+
+
+def _volume(record: CalibrationRecord, uncertainty: Uncertainty) -> Element | None:
+    """Expanded uncertainties of tips and lengths, in both regions, where the data determine them."""
+    everywhere, rows = volumetric_uncertainty(uncertainty), []
+    regions = {"over all joint limits": everywhere.summary}
+    with contextlib.suppress(InputError):  # where no two poses are as far apart as the length
+        poses = np.asarray(record.recording.capture.readings)
+        near = volumetric_uncertainty(uncertainty, length=everywhere.length, near=poses).summary
+        regions = {"where poses were taken": near} | regions
+    for (region, volume), (name, key) in itertools.product(regions.items(), _OVER_VOLUME.items()):
+        values = {says: volume[f"{key}_{statistic}_mm"] for statistic, says in _STATISTICS.items()}
+        if all(map(_is_known, values.values())):
+            decimals = xml.decimals_of(min(values.values()))
+            numbers = [named("quantity", says, real(u, MILLIMETRE, decimals=decimals)) for says, u in values.items()]
+            length = named("quantity", "length", real(float(f"{everywhere.length:.6g}"), MILLIMETRE))
+            rows.append(named("list", f"{name}, {region}", length, numbers))
+    says = (
+        "Expanded uncertainties by the calibration, in poses of the calibration and in random poses within the joint "
+        "limits: of the tip, in its worst direction; and of a measured length, with the noise of both readings."
+    )
+    return _result("Expanded uncertainty", says, *rows) if rows else None
 
 
 def _result(name: str, description: str, *data: Element | Iterator[Element]) -> Element:

@@ -140,6 +140,7 @@ def item(tag: str, name: str, given: CalibratedItem | Reference, *numbers: tuple
     return element(
         tag,
         text("name", name),
+        text("description", condition) if (condition := getattr(given, "condition", None)) else None,
         None if given.manufacturer is None else element("manufacturer", text("name", given.manufacturer)),
         optional("model", given.model),
         element("identifications", identifications) if identifications else None,

@@ -37,7 +37,7 @@ def certificate(
     and their decision rule, and a place for the signature. export --format dcc writes the Digital Calibration
     Certificate alone.
     """
-    from ..certificate.printed import certificate_html, certificate_pdf
+    from ..certificate.printed import printed_certificate
 
     suffix = output.suffix.lower()
     if suffix not in (".pdf", ".html"):
@@ -46,8 +46,8 @@ def certificate(
         record = files.load_calibration(read := InputFile(calibration))
         warn_of_unusable(calibration, record, force)
         dcc, logo = dcc_of(read, record, about, evaluation), None if about is None else files.read_logo(about)
-        make = certificate_pdf if suffix == ".pdf" else certificate_html
-        content = with_spinner("Writing the certificate", lambda: make(dcc, language=language, logo=logo))
+        printed = printed_certificate(dcc, language=language, logo=logo)
+        content = with_spinner("Writing the certificate", printed.pdf if suffix == ".pdf" else printed.html)
         with write_atomically(output) as temporary:
             temporary.write_bytes(content if isinstance(content, bytes) else content.encode())
     typer.echo(f"Written: {output}")

@@ -36,4 +36,5 @@ def one_chain_of(record: Any, chain: str) -> Any:
     capture = Capture({"poses": own.of_robot(readings[readings[:, own.robot_joints] == own.number])})
     true = recording.true and part(recording.true)
     recording = recording._replace(capture=capture, nominal=part(recording.nominal), true=true)
-    return record._replace(recording=recording, calibrated=part(record.calibrated))
+    names = tuple(name for name, of_robot in own.names.items() if of_robot in record.names)
+    return record._replace(recording=recording, calibrated=part(record.calibrated), names=names)

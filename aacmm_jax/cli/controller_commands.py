@@ -100,7 +100,8 @@ def export(
     ),
     motors: str | None = option(
         "Motor (lerobot) or number of the axis (kuka) of each joint, separated by commas, with a minus before one that "
-        "counts against the joint, or that adds its offset, as Dynamixel motors do. Default: in the order of the file.",
+        "counts against the joint, or that adds its offset, as Dynamixel motors do. Default: in the order of the file, "
+        "with the signs of the recording.",
         "NAMES",
     ),
     output: Path | None = output("File to write. Default: standard output.", "FILE", None),
@@ -190,14 +191,18 @@ def _text(record: Any, specification: Any, form: str, calibrated: bool) -> str:
 
 
 def _zero_offsets(record: Any) -> Any:
-    nominal = record.recording.nominal.arm
-    readings = np.asarray(record.recording.capture.readings)[:, : nominal.joints]
-    return files.zero_offsets(nominal, record.calibrated.arm, readings)
+    recording = record.recording
+    nominal, read_as = recording.nominal.arm, recording.read_as
+    readings = np.asarray(recording.capture.readings)[:, : nominal.joints]
+    zeros = files.zero_offsets(nominal, record.calibrated.arm, readings, free=record.names, within_limits=True)
+    complete = read_as and sorted(map(abs, read_as)) == list(range(1, nominal.joints + 1))
+    return zeros._replace(read_as=read_as if complete else None)
 
 
 def _zeros_in_file(record: Any, form: str, file: Path | None, motors: str | None) -> tuple[str, list[str]]:
     """A controller's file with the zero offsets, and what they leave."""
     from ..files.controllers import ZERO_FILES
+    from ..files.controllers.offsets import remaining_error
 
     zeros, source = _zero_offsets(record), record.recording.nominal.urdf
     if file is None:
@@ -206,10 +211,25 @@ def _zeros_in_file(record: Any, form: str, file: Path | None, motors: str | None
         written = files.ros_calibration(source, zeros)
     else:
         written = ZERO_FILES[form](InputFile(file), zeros, None if motors is None else names_option(motors))
-    return written.text, [
-        f"With these zero offsets, the tips of the nominal and the calibrated arm differ by {zeros.rms:.4f} mm RMS "
-        f"({zeros.rms_nominal:.4f} mm without).",
-        *written.notes,
+    return written.text, [*remaining_error(zeros), *_signs_of(record, zeros, motors), *written.notes]
+
+
+def _signs_of(record: Any, zeros: Any, motors: str | None) -> list[str]:
+    """How the signs with which the joints were recorded take part in a controller's file, where they matter."""
+    recorded = zeros.read_as
+    if recorded is None:
+        unknown = "sign" in record.recording.stated and motors is None
+        return ["Warning: the calibration does not store the signs stated in [angles]; state them with --motors (a "
+                "minus before each joint that was recorded with sign = -1)."] * unknown  # fmt: skip
+    against = ", ".join(str(i) for i, number in enumerate(recorded, start=1) if number < 0)
+    if motors is None:
+        return [f"Signs as recorded: joint {against} counts against its motor."] if against else []
+    named = names_option(motors)
+    if [name.startswith("-") for name in named] == [number < 0 for number in recorded]:
+        return []
+    return [
+        f"Warning: --motors has other signs than the recording, where sign is -1 for joint {against or 'none'}; this "
+        "is right only for motors that add their offset (Dynamixel)."
     ]
 
 

@@ -15,13 +15,15 @@ from ..core.text import listed, number
 from ..core.units import DEG
 from ..files.inputs import ROBOT_FILES, fingerprint
 from ..files.outputs import together, write_text
+from ..planning.usual import FARTHEST, HEIGHTS, TILT_DEG
 from . import options
 from .app import command, progress_bar, show_summary, with_spinner
 from .options import bad_option, flag, option, output, seed
 
 _CONTEXT: Any = typer.Context.__base__  # what Typer passes: its own class is a subclass that nothing is of
-_SOCKETS, _FARTHEST = 4, 0.95
+_SOCKETS = 4
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+_AXES |= {f"-{name}": (0.0 - x, 0.0 - y, 0.0 - z) for name, (x, y, z) in _AXES.items()}
 
 # Options that each way of planning takes besides those of all: of a calibration with sockets, of one with a kit, and
 # of an acceptance test.
@@ -84,18 +86,18 @@ def plan(
     seating_mm: float | None = options.USUAL_SEATING_NOISE,
     cone_deg: list[str] | None = option(
         "Largest angle between the tool and the normal of the socket, for all sockets or for the named socket; 180 "
-        "allows any direction. The option may be given several times. Default: 60 for robots, any direction for "
-        "measuring arms. With --kit, set half_angle_deg in the tables of the kit instead.",
+        f"allows any direction. The option may be given several times. Default: {TILT_DEG:g}. With --kit, "
+        "set half_angle_deg in the tables of the kit instead.",
         "[NAME=]DEG",
     ),
     normal: list[str] | None = option(
         "Outward normal of all sockets, or of the named socket; may be given several times. Default: 0,0,1.",
         "[NAME=]X,Y,Z",
     ),
-    tool_axis: str = option(
-        "Axis of the last frame along which the tool points into a socket: x, y, z, -x, -y or -z.",
+    tool_axis: str | None = option(
+        "Axis of the last frame along which the tool points into a socket: x, y, z, -x, -y or -z. Default: z for "
+        "robots, the axis nearest to the probe vector for measuring arms.",
         "AXIS",
-        default="z",
     ),
     retract_mm: float | None = option(
         "Add an approach point to each pose, at this distance from the socket along its normal; 0 adds none. Default: "
@@ -111,8 +113,8 @@ def plan(
     link_radius_mm: float | None = option("Use capsules of this radius along the links as the arm's body.", min=0),
     unconstrained: bool = flag(
         "--unconstrained",
-        "Also predict the uncertainty of a plan without obstacles, approach points and limits of the tool "
-        "direction (--cone-deg).",
+        "Also predict the uncertainty of a plan without obstacles, approach points, and limits of the tool direction "
+        "(--cone-deg) and of the heights of planned sockets (--region).",
     ),
     chain: list[str] | None = option(
         "Plan poses for this chain of a robot; may be given several times. Default: all chains.", "NAME"
@@ -130,7 +132,7 @@ def plan(
     ),
     region: list[str] | None = option(
         "Place sockets only where x, y, z or the distance from the base is in this range (mm); may be given several "
-        "times. Default: z=0:.",
+        f"times. Default: z from {HEIGHTS[0]:g} to {HEIGHTS[1]:g} mm above the table (--above-mm).",
         "AXIS=LOW:HIGH",
     ),
     margin_deg: float = option("Keep joints at least this far from their limits.", default=5.0, min=0),
@@ -145,7 +147,7 @@ def plan(
         "total link length if that is shorter."
     ),
     farthest: float | None = option(
-        f"Place nothing farther from the shoulder than this fraction of the reach. Default: {_FARTHEST}.", "FRACTION"
+        f"Place nothing farther from the shoulder than this fraction of the reach. Default: {FARTHEST}.", "FRACTION"
     ),
     both_sides: bool = flag(
         "--both-sides",
@@ -259,8 +261,6 @@ def _check_options(context: Any, kit: bool, acceptance: bool) -> None:
 def _planned(specification: Any, given: Mapping[str, Any], links: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
     """The plan of a calibration as options say (``given``, by name), and what its summary states of its assumptions;
     what is not given follows from the class of the arm."""
-    from ..data.noise import CLASSES
-
     if given["socket"] and given["sockets"] is not None:
         raise InputError(
             "--sockets plans the positions of the sockets, but --socket states them; give only one of these options."
@@ -276,7 +276,7 @@ def _planned(specification: Any, given: Mapping[str, Any], links: Mapping[str, A
         )
     points, count = options.sockets_option(given["socket"]), given["sockets"] or _SOCKETS
     names = list(points) or [chr(ord("A") + i) for i in range(min(count, 26))]
-    cell, radius, axis = given["cell"], given["link_radius_mm"], given["tool_axis"]
+    cell, radius = given["cell"], given["link_radius_mm"]
     with together(given["output"], given["manifest"]):
         things = None if given["kit"] is None else files.read_kit(given["kit"])
         noise = options.assumed_noise(
@@ -284,18 +284,18 @@ def _planned(specification: Any, given: Mapping[str, Any], links: Mapping[str, A
         )
         to_check = given["collisions"] or cell is not None or radius is not None
         loaded = files.load_cell(given["arm"], cell, **links, radius=radius) if to_check else None
-        if axis.removeprefix("-") not in _AXES:
+        axis = given["tool_axis"] or (_probe_axis(specification.arm) if noise.arm_class == "measuring arm" else "z")
+        if axis not in _AXES:
             bad_option("--tool-axis", axis, "x, y, z, -x, -y or -z")
-        cones = _cones(given, CLASSES[noise.arm_class].cone, names)
+        cones = _cones(given, names)
     usual = planning.PlanOptions.usual(noise)
-    sign = -1.0 if axis.startswith("-") else 1.0
     chosen = usual._replace(
-        tool_axis=tuple(sign * x + 0.0 for x in _AXES[axis.removeprefix("-")]),
+        tool_axis=_AXES[axis],
         cell=None if loaded is None else loaded.cell,
         retract=usual.retract if given["retract_mm"] is None else given["retract_mm"],
         space=specification.space(),
         region=_region(given["region"]),
-        farthest=_FARTHEST if given["farthest"] is None else given["farthest"],
+        farthest=FARTHEST if given["farthest"] is None else given["farthest"],
         margin=given["margin_deg"] * DEG,
         above=given["above_mm"],
         check_length=given["check_length_mm"],
@@ -304,7 +304,7 @@ def _planned(specification: Any, given: Mapping[str, Any], links: Mapping[str, A
         **{name: given[name] for name in ("criterion", "unconstrained", "candidates", "seed")},
     )
     stated = {"noise_source": noise.source, "notes": [] if loaded is None else list(loaded.notes)}
-    stated |= {"angles": given["angles"], "model": given["model"]}
+    stated |= {"angles": given["angles"], "model": given["model"], "tool_axis": axis}
     with progress_bar(transient=True) as bar:
         tasks: dict[str, Any] = {}
 
@@ -321,14 +321,21 @@ def _planned(specification: Any, given: Mapping[str, Any], links: Mapping[str, A
         return planning.plan(specification.arm, **placed, **settings), stated
 
 
-def _cones(given: Mapping[str, Any], default: float, sockets: list[str]) -> Any:
+def _probe_axis(arm: Any) -> str:
+    """The axis of the last frame that is nearest to the probe vector; z where that is 0."""
+    x, y, z = (float(value) for value in arm.probe)
+    value, axis = max(((z, "z"), (x, "x"), (y, "y")), key=lambda pair: abs(pair[0]))
+    return f"-{axis}" if value < 0 else axis
+
+
+def _cones(given: Mapping[str, Any], sockets: list[str]) -> Any:
     """One cone for all sockets, or one for each where some are named."""
     tilts = options.numbers_by_name("--cone-deg", given["cone_deg"], "DEG or NAME=DEG", 1, named=False)
     normals = options.numbers_by_name("--normal", given["normal"], "X,Y,Z or NAME=X,Y,Z", 3, named=False)
 
     def cone(name: str) -> Any:
         tilt, (x, y, z) = tilts.get(name, tilts.get("")), normals.get(name, normals.get("", (0.0, 0.0, 1.0)))
-        return kinematics.Cone(default if tilt is None else math.radians(tilt[0]), (x, y, z))
+        return kinematics.Cone(math.radians(TILT_DEG if tilt is None else tilt[0]), (x, y, z))
 
     named = sorted(filter(None, (*tilts, *normals)))
     return {name: cone(name) for name in dict.fromkeys([*sockets, *named])} if named else cone("")

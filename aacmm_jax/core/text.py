@@ -11,6 +11,7 @@ _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-
 _BEGINS_FORMULA = ("=", "+", "-", "@", "\t")  # in the cell of a spreadsheet
 _LONGEST = 60  # characters of a text that a message quotes
 _LONGEST_NAME, _LONGEST_SENTENCE = 400, 1000
+_LARGE_F = 1000
 _LONG_NAME = re.compile(rf"\S{{{_LONGEST_NAME + 1},}}")
 # Marks that are not seen, or change the direction of what follows, so that a text reads otherwise than it is.
 _MARKS = frozenset("\ufeff\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
@@ -107,3 +108,8 @@ def common_labels(groups: Sequence[Sequence[str]]) -> list[str]:
 def pluralise(number: int, noun: str) -> str:
     """A number of things: ``1 socket``, ``2 sockets``."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def f_text(ratio: float) -> str:
+    """An F statistic as sentences and tables have it: the size of one beyond every critical value says nothing."""
+    return f"= {ratio:.3g}" if ratio < _LARGE_F else f"> {_LARGE_F}"

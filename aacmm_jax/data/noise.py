@@ -168,7 +168,6 @@ class ArmClass(NamedTuple):
     """What arms of a class have in common, where nothing is known of the single one."""
 
     repeatability: float | None  # pose repeatability of ISO 9283, mm; None where the encoders are known instead
-    cone: float  # half angle of the cone from which the tool comes to a socket, rad
     retract: float  # distance of the approach point from the socket, mm
     source: str
 
@@ -188,11 +187,10 @@ class ArmNoise(NamedTuple):
 
 
 CLASSES = {
-    # A person turns the probe in its seat as the standards' tests ask for, and takes it there by hand.
-    "measuring arm": ArmClass(None, math.pi, 0.0, "encoders of a small commercial arm"),
-    # The middle of makers' data sheets for six and seven axes of 0.5 to 1.5 m; 55 deg is what recorded captures keep.
-    "robot": ArmClass(0.05, math.radians(60), 50.0, "typical of data sheets of industrial and collaborative robots"),
-    "hobby arm": ArmClass(1.0, math.radians(60), 50.0, "typical of arms with hobby servos"),
+    "measuring arm": ArmClass(None, 0.0, "encoders of a small commercial arm"),
+    # The middle of makers' data sheets for six and seven axes of 0.5 to 1.5 m.
+    "robot": ArmClass(0.05, 50.0, "typical of data sheets of industrial and collaborative robots"),
+    "hobby arm": ArmClass(1.0, 50.0, "typical of arms with hobby servos"),
 }
 
 

@@ -108,6 +108,8 @@ class Recording(NamedTuple):
             nominal arm is not it, unless somebody says so.
         stated: What somebody stated of how it is to be read, which no search for mistakes overrules: "columns", "sign",
             "offset" and "unit" of the joint readings, "units" of measured points.
+        read_as: Which of the recorded readings is that of each joint, from 1, negative where it counts the other way;
+            None where the signs are not known or those recorded.
         images: What was found in each image of a target.
         notes: What was read of files that hold more than a table, such as the poses in which an arm stood still; files
             of captures do not keep them.
@@ -132,6 +134,7 @@ class Recording(NamedTuple):
     usual: ArmNoise | None = None
     as_found: ArmSpecification | None = None
     stated: tuple[str, ...] = ()
+    read_as: tuple[int, ...] | None = None
     images: tuple[ReadImage, ...] = ()
     notes: tuple[str, ...] = ()
     other_readings: ReadingSet | None = None

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from ..calibration.record import CalibrationRecord, Removed, record_of
 from ..calibration.results import Calibration, Identification
 from ..core.errors import InputError
+from ..core.text import f_text
 from ..core.units import DEG
 from ..data.capture import Capture, names_in, part_of
 from ..data.observations.held import Socket
@@ -85,7 +86,7 @@ def removal(removed: Removed) -> Finding:
         subject, contradict = removed.group, "contradict" if removed.kind == POSES else "contradicts"
     return Finding(
         LEFT_OUT,
-        f"Left out: {subject}, which {contradict} the other data (F = {removed.ratio:.3g} with "
+        f"Left out: {subject}, which {contradict} the other data (F {f_text(removed.ratio)} with "
         f"{first} and {second} degrees of freedom, {chance_text(removed.probability)}).",
         f"Without {these}, the other poses are {removed.rms_without:.3g} mm RMS from their geometry "
         f"instead of {removed.rms_with:.3g} mm. The parameter that changed most is {removed.changed_most}, by "

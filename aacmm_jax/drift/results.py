@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..core.text import shorten
+from ..core.text import f_text, shorten
 from ..core.units import people_read_change
 from ..uncertainty.coverage import in_percent
 from .statistics import JointTest, LengthChange, ProbeTest
@@ -174,7 +174,7 @@ def _of_all(drift: Drift) -> str:
     law = f"chi-squared {test.statistic:.1f} with {test.rank} degrees of freedom"
     if math.isfinite(test.degrees_of_freedom):
         ratio = test.statistic / test.rank
-        law = f"F {ratio:.2f} with {test.rank} and {test.degrees_of_freedom:.0f} degrees of freedom"
+        law = f"F {f_text(ratio)} with {test.rank} and {test.degrees_of_freedom:.0f} degrees of freedom"
     probability = "p < 0.0001" if test.p < 1e-4 else f"p = {test.p:.2g}"
     start = f"Tested together, the changes of {len(test.names)} parameters are"
     if test.p >= 1 - drift.level:

@@ -79,6 +79,7 @@ class CalibratedItem(Strict):
     model: Text | None = None
     serial_number: Text | None = None
     customer_number: Text | None = None  # what the customer calls it by
+    condition: Text | None = None  # in which it came in
 
 
 class Person(Strict):
@@ -103,6 +104,7 @@ class Certificate(Strict):
     """Number, dates and conditions; without dates, begin and end are the day on which the calibration was computed."""
 
     number: Text | None = None
+    replaces: Text | None = None  # number of the certificate that this one takes the place of
     country: Country | None = None  # where it is issued; by default the laboratory's
     received: Date | None = None  # when the arm came in
     begin: Date | None = None

@@ -178,6 +178,7 @@ def _read(
             usual=None if isinstance(arm := model.arm, dict) else _usual_noise(path.parent, arm, model),
             as_found=as_found,
             stated=_stated(model),
+            read_as=None if model.angles is None else model.angles.read_as(nominal.arm.joints),
             images=tuple(images),
             notes=tuple(source.notes),
         )

@@ -90,6 +90,13 @@ class Angles(Strict):
             )
         return self
 
+    def read_as(self, joints: int) -> tuple[int, ...] | None:
+        """`Recording.read_as`; None where no sign is stated."""
+        if "sign" not in self.model_fields_set:
+            return None
+        signs = self.sign if isinstance(self.sign, list) else [self.sign] * joints
+        return tuple(sign * i for i, sign in enumerate(signs, start=1))
+
     def converted(self, readings: Float[np.ndarray, "N n"], arm: Arm) -> Float[np.ndarray, "N n"]:
         """Readings in rad, and in mm of prismatic joints."""
 

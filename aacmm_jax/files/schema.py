@@ -18,6 +18,7 @@ RECORDING: Fields = {
     "stated": text(
         "what the manifest states of the readings and points", among=("", "columns", "sign", "offset", "unit", "units")
     ),
+    "read_as": count("recorded reading of each joint, from 1, negative where it counts the other way", least=None),
 }
 
 NOISE: Fields = {

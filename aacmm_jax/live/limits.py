@@ -110,9 +110,14 @@ def _groups(problem: DesignProblem) -> dict[str, list[int]]:
     """Numbers of the parameters of each joint, and of the probe."""
     groups: dict[str, list[int]] = {}
     for i, name in enumerate(problem.space.names):
-        last = name.rsplit("_", 1)[-1]
-        groups.setdefault(f"joint {last}" if last.isdigit() else "the probe", []).append(i)
+        groups.setdefault(_group(name), []).append(i)
     return groups
+
+
+def _group(name: str) -> str:
+    """The joint that a parameter is of, or the probe."""
+    last = name.rsplit("_", 1)[-1]
+    return f"joint {last}" if last.isdigit() else "the probe"
 
 
 def gained(problem: DesignProblem, known: Candidates, candidate: int) -> str:
@@ -122,4 +127,5 @@ def gained(problem: DesignProblem, known: Candidates, candidate: int) -> str:
     after = np.diagonal(covariance_of(known.information(rows[None]), p))
     most = int(np.argmin(after / before))
     fall = 100 * (1 - np.sqrt(after[most] / before[most]))
-    return f"Improves {problem.space.names[most]} most: its uncertainty falls by {fall:.0f} %."
+    name = problem.space.names[most]
+    return f"This pose tells most about {_group(name)}: the uncertainty of {name} falls by {fall:.0f} %."

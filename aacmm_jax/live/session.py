@@ -192,7 +192,8 @@ class Session:
         try:
             poses = fitting(self._poses_seen, self._stop)
             true = next((arm for device in self._devices if (arm := device.truth()) is not None), None)
-            paths, says = written(self.setup, poses, self.path, calibrate, true)
+            read_as = next((device.read_as for device in self._devices if device.joints), None)
+            paths, says = written(self.setup, poses, self.path, calibrate, true, read_as)
         finally:
             with self._lock:
                 self._busy = None

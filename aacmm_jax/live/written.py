@@ -29,10 +29,16 @@ def fitting(look: Callable[[], tuple[Sequence[TakenPose], Guidance | None]], sto
 
 
 def written(
-    setup: Setup, poses: Sequence[TakenPose], path: Path, calibrate: bool, true: Arm | None = None
+    setup: Setup,
+    poses: Sequence[TakenPose],
+    path: Path,
+    calibrate: bool,
+    true: Arm | None = None,
+    read_as: tuple[int, ...] | None = None,
 ) -> tuple[list[str], list[str]]:
     """Write a capture, and if asked for its calibration and report beside it; the names of the files, and what the
-    calibration says: its verdict, and its warnings. ``true``: the arm of a simulation."""
+    calibration says: its verdict, and its warnings. ``true``: the arm of a simulation; ``read_as``: that of
+    `Recording`."""
     from ..calibration.record import uncertainty_of
     from ..files.calibrations import save_calibration
     from ..pipeline.capture_calibration import calibrate_capture
@@ -42,9 +48,8 @@ def written(
 
     capture, _ = capture_of(setup, poses)
     simulated = None if true is None else setup.specification._replace(arm=true)
-    recording = Recording(
-        capture, setup.specification, simulated, usual=setup.noise, measured=time.strftime("%Y-%m-%d")
-    )
+    day = time.strftime("%Y-%m-%d")
+    recording = Recording(capture, setup.specification, simulated, usual=setup.noise, measured=day, read_as=read_as)
     save_capture(path, recording)
     if not calibrate:
         return [str(path)], []

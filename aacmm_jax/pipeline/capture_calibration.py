@@ -295,4 +295,13 @@ def join_recordings(recordings: Mapping[str, Recording], *, same_probe: bool = F
     )
     sources = tuple(source for recording in recordings.values() for source in recording.sources)
     stated = tuple(sorted({name for recording in recordings.values() for name in recording.stated}))
-    return first._replace(capture=capture, true=None, seed=None, spheres=(), sources=sources, stated=stated)
+    same = all(recording.read_as == first.read_as for recording in rest)
+    return first._replace(
+        capture=capture,
+        true=None,
+        seed=None,
+        spheres=(),
+        sources=sources,
+        stated=stated,
+        read_as=first.read_as if same else None,
+    )

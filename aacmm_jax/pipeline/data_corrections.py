@@ -111,7 +111,9 @@ def with_corrected_readings(
     if capture is None:
         return record, None
     nominal = recording.nominal._replace(arm=_with_zeros(recording.nominal.arm, best))
-    corrected = recording._replace(capture=capture, nominal=nominal)
+    as_recorded = recording.read_as or range(1, len(best.order) + 1)
+    read_as = tuple(sign * as_recorded[column] for sign, column in zip(best.signs, best.order, strict=True))
+    corrected = recording._replace(capture=capture, nominal=nominal, read_as=read_as)
     try:
         again = recorded(solve(corrected), corrected)
     except InputError:

@@ -57,7 +57,8 @@ class Plan(NamedTuple):
     random: Prediction  # median over sets of as many random poses in the same sockets
     loose: Prediction  # the same plan with joints off by 5 deg (standard deviation)
     more: Prediction  # with ten more poses
-    unconstrained: Prediction | None  # for the same sockets without cones, obstacles and approach points
+    unconstrained: Prediction | None  # without limits of height and direction, obstacles and approach points
+    heights: tuple[float, float] | None  # range of z in which sockets were placed, mm; None where they were given
     cones: Cones  # of approach, in the order of the sockets
     cell: Cell | None  # what the poses keep clear of
     retract: float  # distance of the approach points from the sockets, mm; 0 where there are none
@@ -127,8 +128,8 @@ def plan(
                 "of sockets is given."
             )
     problem = problem.within(cones=_cones(cone, names, problem.options.tool_axis))
+    span = (length, length) if isinstance(length, int | float) else length
     if placement is None:
-        span = (length, length) if isinstance(length, int | float) else length
         placement = best_placement(problem, len(names), poses, span, u)
     pool, q, owner = _chosen(problem, placement, names, poses)
     cones = problem.region.cones
@@ -157,6 +158,7 @@ def plan(
         check_length=problem.check_length,
         **_predictions(problem, placement, pool, q, owner),
         unconstrained=None,
+        heights=None if isinstance(sockets, Mapping) else problem.options.ranges["z"],
         cones=cones,
         cell=problem.region.cell,
         retract=problem.options.retract,
@@ -168,10 +170,14 @@ def plan(
             f"{poses} poses in these sockets cannot determine all parameters. {' '.join(unseen.sentences())}"
         )
     if problem.options.unconstrained:
-        free = problem.within(cones=None, cell=None)
+        free = problem.without_limits()
+        if planned.heights:
+            placement = best_placement(free, len(names), poses, span, u)
         _, q, owner = _chosen(free, placement, names, poses)
         anywhere = prediction_of(free, candidates_of(free, placement, pool_of(free, q, owner)))
-        planned = planned._replace(unconstrained=anywhere)
+        # Without limits, the plan itself is possible too: where the search finds nothing better, they cost nothing.
+        best = min(anywhere, planned.predicted, key=lambda prediction: prediction.largest)
+        planned = planned._replace(unconstrained=best)
     return planned
 
 

@@ -54,6 +54,7 @@ class KitPlan(NamedTuple):
     cell: Cell | None = None  # what the poses keep clear of
     retract: float = 0.0  # distance of approach points, mm
     unconstrained: Prediction | None = None  # in the same places without cones, obstacles and approach points
+    heights: tuple[float, float] | None = None  # range of z in which artefacts were placed, mm; None where none were
 
     @property
     def poses(self) -> int:
@@ -124,9 +125,10 @@ def plan_kit(arm: Arm, kit: Sequence[KitItem | AbstractSimulated], *, poses: int
         motions=motions,
         cell=problem.region.cell,
         retract=problem.options.retract,
+        heights=problem.options.ranges["z"] if any(item.places for item in items) else None,
     )
     if problem.options.unconstrained:
-        free = problem.within(cell=None)
+        free = problem.without_limits()
         anywhere = [thing._replace(item=thing.item._replace(half_angle=math.pi)) for thing in things]
         poses_anywhere = _chosen(free, anywhere, _pool(free, anywhere), poses, least)
         unconstrained = prediction_of(free, candidates_of_kit(free, poses_anywhere))

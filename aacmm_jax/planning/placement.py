@@ -218,9 +218,10 @@ def _random_placements(
             placements.append(FixturePlacement(points, ends, (u,) * pairs))
             if len(placements) == _PLACEMENTS:
                 return placements
+    low, high = problem.options.ranges["z"]
     raise InputError(
-        "no placement of the sockets and the reference length was found in the region; widen the region, or shorten "
-        "the length."
+        "no placement of the sockets and the reference length was found in the region "
+        f"(z from {low:g} to {high:g} mm); widen the region, or shorten the length."
     )
 
 

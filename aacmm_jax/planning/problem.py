@@ -30,11 +30,11 @@ from ..kinematics.workspace import (
 )
 from ..uncertainty.volume import default_length, sample_lengths
 from .designs import Candidates, Kind, Objective, covariance_of, exchange
+from .usual import FARTHEST, HEIGHTS
 
 PRIOR = 1e-4  # parameters are known to 100 mm or 100 mrad in advance: makes the first information matrices invertible
 MORE = 10  # poses added in the prediction `Plan.more`
 LOOSE = math.radians(5)  # standard deviation of joints of an imprecise operator
-FARTHEST = 0.95  # part of the reach: beyond it an arm is stretched, and hardly any pose can be taken
 TABLE = "table"
 _NEAR = math.radians(12)  # of candidates near a chosen pose
 _ROUNDS, _NEIGHBOURS = 2, 12  # of the search about the chosen poses, and its candidates for each
@@ -60,7 +60,7 @@ class PlanOptions(NamedTuple):
         criterion: "length" (largest uncertainty of a length over the volume); or "A", "D", "E" of the parameters'
             covariance in natural steps (1 mm, 1 mrad).
         region: Ranges of ``x``, ``y``, ``z`` and of the ``distance`` from the origin for the tip in what is placed, mm
-            (default: z at least 0).
+            (default: z from 20 to 1000 mm above the table, everything without a table).
         farthest: Largest distance of what is placed from the shoulder, as a part of the reach.
         limits: Lowest and highest reading of each joint, rad (default: the arm's own).
         margin: Distance of the joints from their limits, rad.
@@ -74,8 +74,8 @@ class PlanOptions(NamedTuple):
         cell: The arm's body and the obstacles that it may not touch; by default nothing is checked.
         retract: Distance from the socket to the approach point of each pose along the normal, mm; 0 for none. In a kit,
             what has no cone has no approach points.
-        unconstrained: Whether to predict also what poses in the same places would give without cones, cell and approach
-            points.
+        unconstrained: Whether to predict also what as many poses would give without cones, cell and approach points;
+            of sockets that are placed, also without limits of z.
         candidates: Number of candidate configurations (default: 3000, with a kit 2000).
         check_length: Length that predictions are of, mm (as in `volumetric_uncertainty`).
         seed: Seed of the search.
@@ -119,7 +119,8 @@ class PlanOptions(NamedTuple):
     @property
     def ranges(self) -> Ranges:
         """Those of the region."""
-        return {"z": (0.0, np.inf)} if self.region is None else self.region
+        low, high = (self.above + height for height in HEIGHTS)
+        return {"z": (low, high if math.isfinite(low) else math.inf), **(self.region or {})}
 
     def report(self, stage: str, fraction: float) -> None:
         """Say how much of a stage is done."""
@@ -203,6 +204,11 @@ class DesignProblem(NamedTuple):
     def within(self, **changes: Any) -> "DesignProblem":
         """The same with another region: ``cones``, ``cell``."""
         return self._replace(region=self.region._replace(**changes))
+
+    def without_limits(self) -> "DesignProblem":
+        """The same for a tool that may have any direction, in an empty cell, at any height above the table."""
+        region = {**(self.options.region or {}), "z": (self.options.above, np.inf)}
+        return self.within(cones=None, cell=None)._replace(options=self.options._replace(region=region))
 
     def contains(self, points: Float[np.ndarray, "... 3"]) -> Bool[np.ndarray, "..."]:
         """At which points something may be placed."""

@@ -1,7 +1,7 @@
 """Figures of drift: changes of parameters and of lengths between two calibrations, or over the dates of several."""
 
 import datetime
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +70,7 @@ def trend_plots(trend: Trend) -> tuple[Plot, ...]:
         even = span <= 0 or np.min(np.diff(seconds)) < _CROWDED * span
         positions = np.arange(count, dtype=float) if even else (seconds - seconds[0]) / span * (count - 1)
         by_file = trend.dated_by_file or (False,) * count
-        form = "%Y-%m-%d" if span > 86400 else "%m-%d %H:%M"
+        form = _date_form(trend.dates)
         dates = [f"{date:{form}}{'*' if file else ''}" for date, file in zip(trend.dates, by_file, strict=True)]
         title = "calibration" + (", evenly spaced" if even else "")
         title += " (*: date of the file, because the manifest states no date)" if any(by_file) else ""
@@ -129,12 +129,13 @@ def due_chart(trend: Trend, due: Mapping[str, Any] | None) -> Chart:
     days = np.array([(date - first) / datetime.timedelta(days=1) for date in trend.dates])
     rms = np.array([0.0, *(length.rms for length in lengths)])
     chance = np.array([np.nan, *(length.rms_by_chance for length in lengths)])
-    words = [f"{date:%Y-%m-%d}: {value:.4f} mm" for date, value in zip(trend.dates, rms.tolist(), strict=True)]
+    form = _date_form(trend.dates)
+    words = [f"{date:{form}}: {value:.4f} mm" for date, value in zip(trend.dates, rms.tolist(), strict=True)]
     marks = [
         Marks("RMS change of lengths", days, rms, "square", "main", words, joined=True, size=7),
         Marks("expected from the uncertainties alone", days, chance, "ring", "soft"),
     ]
-    labels = {float(day): f"{date:%Y-%m-%d}" for day, date in zip(days, trend.dates, strict=True)}
+    labels = {float(day): f"{date:{form}}" for day, date in zip(days, trend.dates, strict=True)}
     if due:
         date = datetime.datetime.fromisoformat(due["date"])
         day = (date - first) / datetime.timedelta(days=1)
@@ -144,7 +145,7 @@ def due_chart(trend: Trend, due: Mapping[str, Any] | None) -> Chart:
             Marks("next calibration due", [day], rise[1:], "diamond", "accent", [f"{date:%Y-%m-%d}: due"]),
         ]
         labels[day] = f"{date:%Y-%m-%d}"
-    axis = linear("", [*labels], margin=0.05)
+    axis = linear("", [*labels], margin=0.1)  # so that the outermost dates have room
     # The last dates first, as many as have room.
     ticks: list[tuple[float, str]] = []
     for at, label in sorted(labels.items(), reverse=True):
@@ -154,6 +155,11 @@ def due_chart(trend: Trend, due: Mapping[str, Any] | None) -> Chart:
     y = linear("RMS change [mm]", *(part.y for part in marks), zero=True)
     says = f"Lengths of {lengths[0].length:g} mm over the working volume, by each calibration less the first."
     return Chart("due", "Drift of the arm", says, (Plot(axis, y, tuple(marks), height=260),))
+
+
+def _date_form(dates: Sequence[datetime.datetime]) -> str:
+    """Dates that are told apart: those of one day by their time."""
+    return "%Y-%m-%d" if dates[-1] - dates[0] > datetime.timedelta(days=1) else "%m-%d %H:%M"
 
 
 def _changes_of_two(drift: Drift) -> Plot:

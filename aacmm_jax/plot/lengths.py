@@ -179,7 +179,7 @@ def _section(start: np.ndarray, shaded: tuple[np.ndarray, Any], said: Sequence[s
 def volume_chart(volume: VolumetricUncertainty) -> Chart:
     """U of lengths over the working volume: half a section through it."""
     finite = np.isfinite(volume.expanded_length)
-    expanded, name = volume.expanded_length[finite], f"U of a {volume.length:g} mm length"
+    expanded, name = volume.expanded_length[finite], f"U of a {volume.length:.4g} mm length"
     shade, limits = shades(expanded)
     said = [f"U = {format_number(u, decimals_for(u))} mm" for u in expanded.tolist()]
     marks = _section(volume.start[finite], (shade, limits if np.any(finite) else ()), said, name, unit="mm")

@@ -232,9 +232,11 @@ def models_chart(summary: Mapping[str, Any]) -> Chart:
         Marks("poses that were fitted", left, inside, "boxes", "soft", words, box=box),
         Marks("held-out regions, ± one standard error", right, outside, "boxes", "main", words, low, high, box=box),
     )
-    named = [f"{label} (recommended)" if label == summary["recommended"] else label for label in labels]
+    named = [f"✓ {label}" if label == summary["recommended"] else label for label in labels]
     y = linear("RMS distance from the geometry [mm]", inside, outside, high, [0.0], zero=True)
-    description = "RMS distance of poses from their geometry; models from the simplest to the most complex."
+    description = (
+        "RMS distance of poses from their geometry; models from the simplest to the most complex; ✓: recommended."
+    )
     return Chart("models", "Errors by model", description, (Plot(names("", named), y, marks, height=260),))
 
 

@@ -15,6 +15,8 @@ from .charts import Marks, Plot
 _CHARACTER = 6.6  # pixels: mean width of one in a label
 _OVERLAP = 16  # pixels: least distance of labels of the vertical axis
 _WHOLE = 'preserveAspectRatio="none" width="100%" height="100%"'
+_LONGEST = 20  # characters of a slanted name; the middle of longer ones is left out
+_NARROW = 280  # pixels: axes on a telephone
 _LINES = ("line", "dashed", "dotted")
 
 
@@ -22,9 +24,10 @@ def drawn(plot: Plot, label: str) -> str:
     """One plot: its axes and marks; ``label`` is the id of what describes it."""
     x, y = plot.x, plot.y
     left, below = 14 + _CHARACTER * max((len(text) for _, text in y.ticks), default=0), 20.0
-    if x.slanted:
-        longest = max((len(text) for _, text in x.ticks), default=0)
-        below, left = 14 + 0.9 * _CHARACTER * longest, max(left, 12 + 0.5 * _CHARACTER * min(longest, 8))
+    if x.slanted:  # by 60 degrees, to the left of their ticks
+        names = [(len(_short(text)), float(x.at(tick))) for tick, text in x.ticks]
+        below = 14 + 0.9 * _CHARACTER * max(length for length, _ in names)
+        left = max(left, *(12 + 0.5 * _CHARACTER * length - _NARROW * at for length, at in names))
     title, y_title, x_title = (
         f'<p class="{kind}">{html.escape(words)}</p>' if words else ""
         for kind, words in (("plot-title", plot.title), ("axis-title", y.title), ("axis-title below", x.title))
@@ -175,12 +178,18 @@ def _labels(plot: Plot) -> Iterator[str]:
             last = position
             yield f'<text x="-7" y="{position:.2f}%" dy="4" class="end">{html.escape(words)}</text>'
     for tick, words in plot.x.ticks:
-        position, words = f"{100 * float(plot.x.at(tick)):.2f}%", html.escape(words)
+        position = f"{100 * float(plot.x.at(tick)):.2f}%"
+        words = html.escape(_short(words) if plot.x.slanted else words)
         if plot.x.slanted:
             text = f'<text class="end" transform="translate(4 12) rotate(-60)">{words}</text>'
             yield f'<svg x="{position}" y="100%">{text}</svg>'
         else:
             yield f'<text x="{position}" y="100%" dy="16" class="middle">{words}</text>'
+
+
+def _short(name: str) -> str:
+    half = _LONGEST // 2
+    return name if len(name) <= _LONGEST else f"{name[:half]}…{name[1 - half :]}"
 
 
 def _glyph(marks: Marks) -> str:

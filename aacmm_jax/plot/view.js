@@ -254,13 +254,14 @@ export class View {
 
   // What else stands there: bars, plates and targets, balls, and the lines of sight of cameras.
   #things() {
-    for (const { kind, points, radius = 0, name } of this.scene.things) {
+    for (const { kind, points, radius = 0, name, faint } of this.scene.things) {
       const seen = points.map((point) => this.#project(point));
       const depth = seen.reduce((sum, point) => sum + point[2], 0) / seen.length;
       const middle = [0, 1].map((i) => seen.reduce((sum, point) => sum + point[i], 0) / seen.length);
       const size = Math.max(3, radius * this.scale / this.extent * seen[0][3]);
       this.strokes.push({ depth, paint: () => {
-        if (kind === "bar") {
+        if (faint) this.pen.line(seen, "soft", 1.2);
+        else if (kind === "bar") {
           this.pen.line(seen, "page", 9);
           this.pen.line(seen, "thing", 6);
           this.pen.line(seen, "page", 1);
@@ -298,6 +299,10 @@ export class View {
     for (const place of places) {
       if (!usable(place.position)) continue;
       const at = this.#project(place.position);
+      if (place.faint) {
+        this.strokes.push({ depth: at[2], paint: () => pen.dot(at, 2.5, "page", "soft", 1.2) });
+        continue;
+      }
       const foot = this.#project([place.position[0], place.position[1], this.floor]);
       pen.line([at, foot], "line", 1, [2, 4]);
       this.strokes.push({ depth: at[2], paint: () => {

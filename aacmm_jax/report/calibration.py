@@ -88,7 +88,7 @@ def _numbers(summary: dict[str, Any], distances: dict[str, np.ndarray]) -> list[
     stated, length = length_uncertainty(summary["uncertainty"]), summary["uncertainty"]["volume"]["length_mm"]
     value, where, rest = (stated or "not determined everywhere").partition(" where ")
     value, unit, everywhere = (value, "", where + rest) if where else value.partition(" mm")
-    numbers.append((f"U of a {length:g} mm length ({LEVEL_IN_PERCENT})", f"{value}{unit}", everywhere.strip()))
+    numbers.append((f"U of a {length:.4g} mm length ({LEVEL_IN_PERCENT})", f"{value}{unit}", everywhere.strip()))
     validated, held_out = summary["cross_validation"], summary.get("held_out_poses")
     if validated is not None and validated["rms_mm"] is not None:
         predicted = validated["rms_predicted_mm"]
@@ -115,7 +115,8 @@ def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
         facts.append(
             (f"{pluralise(row['poses'], 'held-out pose')}, distance: RMS / mean / largest", f"{numbers}\u00a0mm")
         )
-    for row in summary["kinds"][:_MOST_KINDS]:
+    kinds = summary["kinds"]
+    for row in kinds[:_MOST_KINDS] if len(kinds) > 1 else ():  # the RMS of a single kind is the first number
         title = f"RMS residual, {row['kind']}, nominal → calibrated"
         facts.append((title, changed(row["rms_before_mm"], row["rms_after_mm"])))
     if summary.get("lengths_tested"):

@@ -165,7 +165,7 @@ def volume(volume: VolumetricUncertainty, summary: dict[str, Any]) -> Section:
     positions = {f"{axis} [mm]": numbers(volume.start[:, k], 0) for k, axis in enumerate("xyz")}
     for name, u in (
         ("U of the tip [mm]", volume.expanded_tip),
-        (f"U of a {volume.length:g} mm length [mm]", volume.expanded_length),
+        (f"U of a {volume.length:.4g} mm length [mm]", volume.expanded_length),
         ("with noise of both readings [mm]", volume.expanded_length_reading),
     ):
         positions[name] = [with_u_digits(float(value)) for value in u]

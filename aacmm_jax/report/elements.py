@@ -12,6 +12,7 @@ from scipy.spatial import ConvexHull
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord
 from ..core.numpy_or_jax import AnyArray
+from ..core.text import f_text
 from ..core.units import people_read
 from ..data.capture import Capture
 from ..data.observations.held import Artefact
@@ -43,6 +44,8 @@ from ..summaries.tables import (
 
 DRAWN = 1000  # most poses in a chart
 _VIEWED = 150  # most poses in the view of the arm
+_MANY_BARS = 8  # in one picture
+_MANY = "thick: the pose that the slider selects, and its bar; thin lines: the other positions of bars"
 _HEADLINE = 90  # characters: a longer beginning of a verdict is no headline
 _LEGEND = {
     "bar": "grey bars: certified lengths",
@@ -102,7 +105,8 @@ class Report(NamedTuple):
         for match in re.finditer("[:;.] ", self.verdict[:_HEADLINE]):
             start, rest = self.verdict[: match.start()], self.verdict[match.end() :]
             if start.count("(") == start.count(")"):
-                return start, rest[:1].upper() + rest[1:] if rest.split()[0].strip(".,;").isalpha() else rest
+                word = rest.split()[0].strip(".,;").replace("-", "").isalpha()  # not a symbol such as "d_5"
+                return start, rest[:1].upper() + rest[1:] if word else rest
         return self.verdict, ""
 
 
@@ -125,7 +129,9 @@ def view_of_arm(
     tips = np.asarray(arm.position(capture.q))
     marks = {name: tips[capture.owner == i].mean(axis=0) for i, name in enumerate(capture.names)}
     lines, moving = skeleton(arm, q[chosen]), dict[int, np.ndarray]()
-    things = [_thing("bar", [marks[length.start], marks[length.end]]) for length in capture.lengths]
+    pairs = [(length.start, length.end) for length in capture.lengths]
+    many = len(pairs) > _MANY_BARS  # of which the view shows one at a time: it knows their ends by name
+    things = [_thing("bar", [marks[a], marks[b]], **({"ends": [a, b]} if many else {})) for a, b in pairs]
     if residuals is None and not capture.observations:
         residuals = tips - np.array([*marks.values()])[owner]
     for i, observation in enumerate(capture.observations, start=len(capture.names)):
@@ -147,6 +153,7 @@ def view_of_arm(
     poses: list[dict[str, Any]] = []
     for i, line, shown in zip(chosen, lines, shade.tolist(), strict=True):
         pose = {"label": labels[i], "points": np.round(line, 1).tolist()}
+        pose |= {"mark": capture.names[owner[i]]} if many and owner[i] < len(capture.names) else {}
         pose["carried"] = np.round(moving.get(int(i), ()), 1).tolist()
         if distances is not None:
             finite = bool(np.isfinite(distances[i]))
@@ -161,7 +168,7 @@ def view_of_arm(
         "poses": poses,
     }
     drawn, sights = {thing["kind"] for thing in things}, any(len(pose["carried"]) for pose in poses)
-    legend = ["thick: the pose that the slider selects; grey lines: other poses"]
+    legend = [_MANY if many else "thick: the pose that the slider selects; grey lines: other poses"]
     legend += [words for kind, words in _LEGEND.items() if kind in drawn or (kind == "sight" and sights)]
     what = f"its {'points' if capture.observations else 'sockets'}, " if marks else ""
     says = "Drag, or use the arrow keys, to rotate the view; press plus or minus to zoom. The slider selects the pose."
@@ -298,7 +305,7 @@ def removed_tables(record: CalibrationRecord) -> list[Table]:
         "group": lambda left_out: left_out.group,
         "kind": lambda left_out: left_out.kind,
         "its sockets and observations": lambda left_out: ", ".join(left_out.members),
-        "F": lambda left_out: number(left_out.ratio, 1),
+        "F": lambda left_out: f_text(left_out.ratio).removeprefix("= "),
         "degrees of freedom": lambda left_out: "{} and {}".format(*left_out.degrees_of_freedom),
         "p": lambda left_out: left_out.probability if left_out.probability >= 1e-4 else "< 0.0001",
         "RMS of the other data, fitted with the group [mm]": lambda left_out: left_out.rms_with,

@@ -84,6 +84,7 @@ def write_report(
         read = source if kind == "study" else InputFile(source)  # a study is read in parts
         attributes = read_tables(read, (kind,), without=("trials",)).attributes
         report = _report_of(kind, read, attributes)
+        report = report._replace(subtitle=f"{report.subtitle}; {_identity(attributes, administrative_data)}")
         if report.simulated:
             warnings = list(dict.fromkeys([SIMULATED, *report.warnings]))
             mark = "unsure" if report.decision == "conforms" else report.verdict_mark  # no real arm conforms
@@ -138,6 +139,16 @@ def write_plan(
         report = plan_report(planned, shown, view(shown), plan_csv(planned, angles, both_sides))
         attributes = provenance("plan") | {"sources": list(sources) or ["none"]}
         return _written(report, _origin(None, attributes), Path(target))
+
+
+def _identity(attributes: dict[str, Any], given: AdministrativeData | None) -> str:
+    """When it was measured, or else calculated, and which item and certificate it is of: on the first printed page."""
+    measured, numbers = str(attributes.get("measured") or ""), []
+    if given is not None:
+        titled = ("serial number", given.item.serial_number), ("certificate", given.certificate.number)
+        numbers = [f"{title} {value}" for title, value in titled if value]
+    date = f"measured on {measured}" if measured else f"calculated on {str(attributes['created'])[:10]}"
+    return "; ".join([date, *numbers])
 
 
 def _written(report: Report, origin: list[tuple[str, list[str]]], target: Path) -> dict[str, Any]:

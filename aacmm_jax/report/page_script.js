@@ -151,8 +151,11 @@
     const { marks, things, from, poses } = parsed("scenes")[container.dataset.scene];
     const view = new View(container, new SvgPen(container)), figure = container.closest("figure");
     const slider = figure.querySelector("input"), output = figure.querySelector("output");
+    // Of many bars, only that of the selected pose stands out, and other poses are not drawn.
+    const ends = new Set(things.flatMap((thing) => thing.ends ?? []));
     // Not every so many: the chains of a robot may take turns.
-    const others = poses.filter((_, i) => (0.618034 * i) % 1 < 24 / poses.length).map((pose) => pose.points);
+    const others = poses.filter((_, i) => !ends.size && (0.618034 * i) % 1 < 24 / poses.length)
+      .map((pose) => pose.points);
     for (const button of figure.querySelectorAll("button[data-do]")) {
       button.addEventListener("click", () => view.move(button.dataset.do));
     }
@@ -163,10 +166,15 @@
         : `: ${pose.distance.toPrecision(3)} mm from its ${from}`;
       output.textContent = pose.label + distance;
       const carried = pose.carried.length ? [{ kind: "sight", points: pose.carried }] : [];
-      view.show({ links: pose.points, things: [...things, ...carried] });
+      const here = things.find((thing) => thing.ends?.includes(pose.mark))?.ends ?? [];
+      const faint = (name) => ends.has(name) && !here.includes(name);
+      view.show({
+        links: pose.points,
+        places: marks.map(({ name, at }) => ({ name, position: at, faint: faint(name) })),
+        things: [...things.map((thing) => ({ ...thing, faint: faint(thing.ends?.[0]) })), ...carried],
+      });
     };
     view.scene.others = others;
-    view.scene.places = marks.map(({ name, at }) => ({ name, position: at }));
     view.scene.poses = poses.map((pose) => ({ tip: pose.points.at(-1), residual: pose.residual, shade: pose.shade }));
     slider.addEventListener("input", choose);
     choose();

@@ -51,7 +51,9 @@ def _numbers(summary: dict[str, Any]) -> list[tuple[str, str, str]]:
     numbers = [("Poses", str(summary["poses"]), "")]
     if summary["kind"] == "acceptance plan":
         bars = sum(bar["positions"] for bar in summary["bars"])
-        return [*numbers, ("Positions of bars", str(bars), ""), ("Spheres", str(len(summary["spheres"])), "")]
+        points = {item["name"] for item in summary["items"] if item["test"] == "single point"}
+        others = ("Spheres", len(summary["spheres"])) if summary["spheres"] else ("Sockets", len(points))
+        return [*numbers, ("Positions of bars", str(bars), ""), (others[0], str(others[1]), "")]
     length = f"U of a {summary['check_length_mm']:g} mm length"
     for key, note in (("predicted", f"by this plan; {K_IN_WORDS}"), ("random", "by as many random poses")):
         values = [COVERAGE_FACTOR * summary[key][f"{which}_mm"] for which in ("median", "largest")]
@@ -77,9 +79,13 @@ def _picture(planned: Plan | KitPlan | Procedure) -> ArmView:
 
 
 def _table(poses: str) -> Table:
-    """The poses with a box to tick, without the direction of the probe, which the joints determine."""
+    """The poses with a box to tick, without the direction of the probe, which the joints determine, and without files
+    that are called as the sockets are."""
     headings, *rows = csv.reader(io.StringIO(poses))
     shown = [i for i, heading in enumerate(headings) if not heading.startswith("probe_direction")]
+    if {"name", "file"} <= {*headings}:
+        name, file = headings.index("name"), headings.index("file")
+        shown = [i for i in shown if i != file or any(row[file] != f"{row[name]}.csv" for row in rows)]
     moves = headings.index("move") if "move" in headings else None
     # An approach is not recorded.
     boxes = ["" if moves is not None and row[moves] in ("approach", "retract") else "☐" for row in rows]

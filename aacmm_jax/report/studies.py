@@ -1,5 +1,6 @@
 """The reports of many calibrations: of a Monte Carlo study, and of compared models, inside and outside, by region."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from ..study.tables import (
     shown_unit,
 )
 from ..summaries.compared_models import MODELS_MEANING, model_tables
-from ..summaries.tables import format_number, number
+from ..summaries.tables import format_number
 from .elements import Report, Section
 
 _SHOWN = (
@@ -87,7 +88,9 @@ def _spread(cells: list[dict[str, Any]], name: str) -> tuple[str, str, str]:
     """The medians of a metric over the cells."""
     unit, factor = shown_unit(name)
     known = [factor * cell["figures"][name]["p50"]["value"] for cell in cells if name in cell["figures"]]
-    ends = dict.fromkeys(f"{end:.3g}" for end in (min(known), max(known)))
+    ends = dict.fromkeys(
+        np.format_float_positional(end, 3, unique=False, fractional=False, trim="-") for end in (min(known), max(known))
+    )
     note = "median of the converged trials" + (" of a cell" if len(known) > 1 else "")
     title = metric_title(name).partition(" [")[0]
     return title[:1].upper() + title[1:], f"{' to '.join(ends)} {unit}".strip(), note
@@ -142,11 +145,7 @@ def models_report(summary: dict[str, Any]) -> Report:
         numbers=[
             ("Recommended model", chosen["model"], ""),
             ("Its RMS error in held-out regions", f"{format_number(chosen['rms_outside'])}\u00a0mm", ""),
-            (
-                "Its (error / predicted standard deviation)²",
-                number(chosen["ratio"], 2).text,
-                "mean in held-out regions",
-            ),
+            ("Its error / the predicted error", f"{math.sqrt(chosen['ratio']):.2f}", "RMS; 1 is expected"),
         ],
         picture=models_chart(summary),
         facts=[],

@@ -45,8 +45,8 @@ def finding(summary: Mapping[str, Any]) -> str:
     large = [effect for effect in effects if effect.ratios.max() > 1 + _ALIKE]
     what = _METRICS[metric]
     if not large:
-        names = " and ".join(factor_title(name).partition(" [")[0] for name in varied)
-        return f"{names[:1].upper()}{names[1:]}: no level changes the {what} by more than {100 * _ALIKE:.0f} %."
+        names = " or ".join(factor_title(name).partition(" [")[0] for name in varied)
+        return f"No level of {names} changes the {what} by more than {100 * _ALIKE:.0f} %."
     sentences = [_in_words(effect, what) for effect in large[:_MOST]]
     means = " (means over the other factors)" if len(varied) > 1 else ""
     return " ".join(f"{sentence[:1].upper()}{sentence[1:]}{means}." for sentence in sentences)

@@ -51,12 +51,12 @@ def compared_models_summary(compared: ComparedModels, arm: str) -> dict[str, Any
         }
         for model, (difference, u_difference) in zip(compared.models, compared.differences, strict=True)
     ]
-    finding = f"Recommended: {chosen.model}, which predicts held-out regions best of all models compared."
+    finding = f"{chosen.model} is recommended: it predicts held-out regions best of all models compared."
     if chosen is not best:
         difference, u = rms_difference(rows[compared.models.index(chosen)], best.rms_outside)
         finding = (
-            f"Recommended: {chosen.model}. The error of this model on held-out regions is not significantly larger "
-            f"than the error of the best model ({best.model}): the difference is {difference:.2g} mm, with a standard "
+            f"{chosen.model} is recommended: its error on held-out regions is not significantly larger "
+            f"than that of the best model ({best.model}): the difference is {difference:.2g} mm, with a standard "
             f"error of {u:.2g} mm from the scatter of the regions. {chosen.model} is the simplest model for which "
             "this holds and under which the measurements are about equally probable."
         )

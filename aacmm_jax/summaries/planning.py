@@ -25,7 +25,7 @@ _PREDICTED = {
     "loose": "this plan, with joints set only to within about 5 deg",
     "random": "{poses} random poses in the same {where}",
     "more": "this plan and {more_poses} more poses",
-    "unconstrained": "the same number of poses, planned without cones, obstacles and approach points",
+    "unconstrained": "{poses} poses planned without limits of {limited}",
 }
 
 
@@ -96,6 +96,7 @@ def _stated(
         "linear_encoder_mm": linear_encoder_mm(plan.noise, plan.arm),
         "seating_mm": float(plan.noise.seating),
         "largest_tilt_deg": float(np.degrees(tilts.max())) if len(tilts) else None,
+        "heights_mm": plan.heights and [height if math.isfinite(height) else None for height in plan.heights],
         "retract_mm": plan.retract if any(motion.approach is not None for motion in motions) else 0.0,
         "travel_deg": math.degrees(sum(motion.travel for motion in motions)),
         "unordered_travel_deg": math.degrees(sum(motion.unordered for motion in motions)),
@@ -149,6 +150,7 @@ def plan(summary: dict[str, Any]) -> View:
     for row in summary["lengths"]:
         ends = f"{row['from']} - {row['to']}"
         yield f"Reference length {ends}: {row['value_mm']:.1f} mm, u = {row['u_mm']:.3g} mm"
+    yield from _limits(summary, {row["cone_deg"] for row in summary["sockets"]})
     yield from _predictions(summary, "sockets")
     yield from written_of(summary)
 
@@ -173,6 +175,7 @@ def kit_plan(summary: dict[str, Any]) -> View:
         others = [row for row in summary["observations"] if not f"{row['observation']}/".startswith(f"{name}/")]
         poses = sum(place["poses"] for row in others for place in row["places"])
         without[f"without {name}: {pluralise(poses, 'pose')}"] = prediction
+    yield from _limits(summary, set())
     yield from _predictions(summary, "places", without)
     yield from written_of(summary)
 
@@ -192,12 +195,29 @@ def _answer(summary: dict[str, Any]) -> View:
     )
 
 
+def _limits(summary: dict[str, Any], cones: set[float]) -> View:
+    """Where sockets or artefacts may be placed, and from which directions the tool may come to them."""
+    limits, (low, high) = [], summary["heights_mm"] or (None, None)
+    if low is not None or high is not None:
+        ends = [f"from {low:g} mm"] * (low is not None) + [f"to {high:g} mm"] * (high is not None)
+        limits.append(f"{'sockets' if cones else 'artefacts'} at z {' '.join(ends)} (--region)")
+    if min(cones, default=180) < 180:
+        angle = f"{min(cones):.3g} deg" if len(cones) == 1 else "the angle in the table"
+        axis = f" (axis {summary['tool_axis']} of the last frame)" if "tool_axis" in summary else ""
+        limits.append(f"tool{axis} within {angle} of the socket normal (--cone-deg)")
+    if limits:
+        cost = "" if summary["unconstrained"] else " To see what these limits cost, add --unconstrained."
+        yield f"Limits: {'; '.join(limits)}.{cost}"
+
+
 def _predictions(summary: dict[str, Any], where: str, without: dict[str, Any] | None = None) -> View:
     """U of a length by this plan, and by what it is compared with; the noise it assumes; how the arm moves."""
     length = f"{summary['check_length_mm']:g} mm"
     title = f"Contribution of the calibration to U of lengths of {length} over the volume [mm, {K_IN_WORDS}]"
     yield ["\n", Styled(title)]
-    titles = {key: text.format(**summary, where=where) for key, text in _PREDICTED.items()}
+    limited = "direction, obstacles and approach points"
+    limited = f"height, {limited}" if where == "sockets" and summary["heights_mm"] else limited
+    titles = {key: text.format(**summary, where=where, limited=limited) for key, text in _PREDICTED.items()}
     predictions = {title: summary[key] for key, title in titles.items() if summary[key] is not None} | (without or {})
     yield listed("", predictions.items(), {
         "": lambda row: row[0],
@@ -283,7 +303,7 @@ def procedure(summary: dict[str, Any]) -> View:
         name = row["name"] if other is None else bar
         rows.append((row["test"], name, row["group"], at(row["position_mm"]), end, f"{row['poses']}{poses}"))
     headings = ("test", "name", "group", "at (x, y, z) [mm]", "to (x, y, z) [mm]", "poses")
-    yield listed("", rows, headings)
+    yield listed("Positions", rows, headings)
     yield (
         "Checked: joint limits, reach, that no part of the arm is below the table, and that spheres are touched from "
         "outside. Not checked: obstacles, collisions of the arm with itself, and how artefacts are mounted."

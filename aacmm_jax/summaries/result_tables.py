@@ -84,15 +84,15 @@ def validation_tables(summary: Row) -> list[Table]:
         lengths = any(row["lengths"] for row in rows)
         shown.append(listed("Groups held out [mm]", rows, {
             "group held out": "group",
+            "": lambda row: _said(
+                "disagrees" if row["disagrees"] else "" if row["converged"] else "did not converge", "bad"
+            ),
             "poses": "poses",
             "RMS distance": "rms_mm",
             "predicted": "rms_predicted_mm",
             "RMS length error": "length_error_rms_mm" if lengths else None,
             "u": "length_u_mm" if lengths else None,
             "probability [%]": lambda row: number(None if row["probability"] is None else 100 * row["probability"], 2),
-            "": lambda row: _said(
-                "disagrees" if row["disagrees"] else "" if row["converged"] else "did not converge", "bad"
-            ),
         }))  # fmt: skip
     return shown
 
@@ -214,7 +214,7 @@ def base_table(frames: Rows, factor: float, caption: str = "") -> Table:
 
 def volume_table(caption: str, volume: Row) -> Table:
     """Expanded uncertainty of tips and lengths over the working volume."""
-    length = f"{volume['length_mm']:g} mm length"
+    length = f"{volume['length_mm']:.4g} mm length"
     titles = {
         "expanded_tip": "tip position (worst direction): contribution of the calibration",
         "expanded_length": f"{length}: contribution of the calibration",

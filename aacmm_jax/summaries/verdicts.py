@@ -51,7 +51,7 @@ def calibration_verdict(
         return Verdict("bad", f"Not usable: {says}." if says else f"Not usable. {unusable[0].says}", False)
     doubts = list(dict.fromkeys(finding.doubt or _LACKING for finding in findings if finding.severity == "doubt"))
     values, length = length_uncertainty(uncertainty), uncertainty["volume"]["length_mm"]
-    stated = f"{U_AT_LEVEL} of a measured length of {length:g} mm is {values}"
+    stated = f"{U_AT_LEVEL} of a measured length of {length:.4g} mm is {values}"
     if values is None:
         doubts = ["the data do not determine lengths everywhere in the working volume", *doubts]
         return Verdict("unsure", f"To be used with care: {'; '.join(doubts)}.")

@@ -9,10 +9,13 @@ from .tables import STYLES, Styled, View, listed, plain
 
 _VERDICTS = {"better": "good", "worse": "bad", "equivalent": "neutral", "not decided": "unsure"}
 _LITTLE = 0.1  # of the RMS error: a smaller gain of a recalibration is none
-MEANING = (
+_RMS_ERROR = (
     "RMS error: RMS distance of a pose from its socket, point or board position, after the tip of the tool and the "
-    "frames and positions that no maker states were fitted; it includes the repeatability. Real share: how much of the "
-    "difference between nominal and delivered parameters these poses confirm: 1 all, 0.5 and less no improvement."
+    "frames and positions that no maker states were fitted; it includes the repeatability."
+)
+_REAL_SHARE = (
+    "Real share: how much of the difference between nominal and delivered parameters these poses confirm: 1 all, 0.5 "
+    "and less no improvement."
 )
 
 
@@ -25,6 +28,7 @@ def verification_summary(checked: Verification, arm: str, delivered: str) -> dic
             ("delivered", checked.delivered, checked.length_errors[1]),
         )
     ]
+    share = [None] * 3 if checked.same else [checked.share, checked.share_lower, checked.share_upper]
     return {
         "kind": "verification",
         "arm": arm,
@@ -32,7 +36,7 @@ def verification_summary(checked: Verification, arm: str, delivered: str) -> dic
         "verdict": checked.verdict,
         "says": _verdict(checked),
         "accuracy": rows,
-        "share": {"value": checked.share, "lower": checked.share_lower, "upper": checked.share_upper},
+        "share": dict(zip(("value", "lower", "upper"), share, strict=True)),  # of no difference there is none
         "volume_ratio": {"lower": checked.ratio_lower, "upper": checked.ratio_upper, "margin": MARGIN},
         "probability": checked.probability,
         "poses": checked.poses,
@@ -62,7 +66,7 @@ def _verdict(checked: Verification) -> str:
     nominal, delivered = checked.nominal, checked.delivered
     of_delivered = f"{delivered.rms:.3g} mm RMS ({LEVEL_IN_PERCENT}: {delivered.lower:.3g} to {delivered.upper:.3g} mm)"
     if checked.same:
-        return f"The delivered parameters are the nominal ones: {of_delivered} in these poses."
+        return f"No difference: in these poses, both sets of parameters are the same, and err by {of_delivered}."
     against = (
         f"with the delivered parameters the tip errs by {of_delivered}, with the nominal ones by {nominal.rms:.3g} mm"
     )
@@ -108,10 +112,9 @@ def _poses(checked: Verification) -> str:
 
 def _gain(checked: Verification) -> str:
     """What a recalibration gains."""
-    volume = (
-        f"Over the working volume, the delivered parameters are expected to err by {checked.volume:.2g} mm RMS, "
-        f"{checked.ratio_lower:.2g} to {checked.ratio_upper:.2g} times as much as the nominal ones (90 %)"
-    )
+    volume = f"Over the working volume, the delivered parameters are expected to err by {checked.volume:.2g} mm RMS"
+    if not checked.same:
+        volume += f", {checked.ratio_lower:.2g} to {checked.ratio_upper:.2g} times as much as the nominal ones (90 %)"
     left = f"a calibration with these poses by {checked.recalibrated:.2g} mm"
     if checked.gain > _LITTLE * checked.volume:
         return f"{volume}, and {left}: it would gain {checked.gain:.2g} mm."
@@ -133,10 +136,10 @@ def verification(summary: dict[str, Any]) -> View:
         "errors of lengths [mm]": lengths,
     }
     yield listed(f"{summary['arm']}; delivered: {summary['delivered']}", summary["accuracy"], columns)
-    share = summary["share"]
-    yield (
-        f"Real share of the difference: {share['value']:.2f} ({LEVEL_IN_PERCENT}: {share['lower']:.2f} to "
-        f"{share['upper']:.2f}). "
-        f"{pluralise(summary['poses'], 'pose')}, {summary['equations']} equations, {summary['unknowns']} unknowns."
-    )
-    yield MEANING
+    share, real = summary["share"], ""
+    if share["value"] is not None:
+        interval = f"{LEVEL_IN_PERCENT}: {share['lower']:.2f} to {share['upper']:.2f}"
+        real = f"Real share of the difference: {share['value']:.2f} ({interval}). "
+    poses = pluralise(summary["poses"], "pose")
+    yield f"{real}{poses}, {summary['equations']} equations, {summary['unknowns']} unknowns."
+    yield f"{_RMS_ERROR} {_REAL_SHARE}" if real else _RMS_ERROR

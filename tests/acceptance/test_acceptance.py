@@ -688,6 +688,7 @@ def test_an_arm_that_cannot_take_a_zone_goes_without_it():
     assert_refused(lambda: plan_procedure(aj.load_arm("iiwa14"), "vdi"), "choose one of jjf, asme, iso")
 
 
+@pytest.mark.slow
 def test_planned_poses_can_be_taken(cheng, procedure):
     limits = np.array(cheng.arm.limits or [(-math.pi, math.pi)] * 6)
     for item in (*procedure.sockets, *procedure.touches):

@@ -209,6 +209,7 @@ def long_table(eye):
 TARGET = SimpleNamespace(ids=np.arange(20), points=np.array(BOARD), u_scale=0.0)
 
 
+@pytest.mark.slow
 def test_a_table_of_corners_gives_intrinsics_and_noise():
     """Nothing is stated of the camera: start and standard deviation come from the corners, which are all kept."""
     (eye,) = aj.simulate(TRUE, {}, observations=[seen(poses=12)], seed=1).observations
@@ -221,7 +222,7 @@ def test_a_table_of_corners_gives_intrinsics_and_noise():
     assert made.images[3] == "3.png"
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -240,7 +241,7 @@ def test_bad_tables_of_corners(change, message):
         kinds.pixels_of("eye", eye.q, table, TARGET, camera)
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("fields", "message"),
     [

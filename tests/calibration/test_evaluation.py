@@ -30,6 +30,7 @@ def test_the_true_arm_has_residuals_of_one_standard_deviation(paper_arm, capture
         assert float(np.sqrt(np.mean(np.sum(residuals**2, axis=0)))) == pytest.approx(float(rms))
 
 
+@pytest.mark.slow
 def test_sockets_and_lengths_are_as_without_observations(paper_arm, capture):
     """Poses of a socket have nearly the same weight."""
     alone = aj.evaluate(paper_arm, aj.Capture(capture.sockets, capture.lengths))

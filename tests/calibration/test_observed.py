@@ -198,7 +198,7 @@ def _composed(outer, inner):
     return (*rotation_vector(first @ rotation_matrix(inner[:3])), *(first @ inner[3:] + outer[3:]))
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("robust", [*(pytest.param(x, marks=pytest.mark.slow) for x in ("huber", "cauchy")), "tukey"])
 def test_a_robust_loss_withstands_bad_poses(paper_arm, true, space, bounds, sockets, robust):
     """One pose in ten is 1 degree off in one joint: least squares is far off, a robust loss is not."""

@@ -187,7 +187,7 @@ def test_one_placement_cannot_be_cross_validated(arm, bounds, capture):
         aj.cross_validate(arm, alone, bounds)
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.first_rows(1)
 @pytest.mark.filterwarnings("ignore:.* the scale, so the reference lengths have no effect")
 @pytest.mark.parametrize(
     ("options", "text"), [({"digits": 3}, "digits is 3; choose one of 1, 2"), ({"level": 95}, "level is 95")]

@@ -348,6 +348,7 @@ def test_a_batch_is_refused_in_one_sentence(paper_arm, capture, cut, what, funct
     assert str(refused.value).count(".") == 1
 
 
+@pytest.mark.slow
 def test_a_batch_of_arms_is_evaluated_arm_by_arm(paper_arm, too_long, capture):
     both = jax.tree.map(lambda *leaves: jnp.stack(leaves), paper_arm, too_long)
     found = aj.evaluate(both, capture)

@@ -34,6 +34,7 @@ manufacturer = "maker"
 model = "X'1"
 serial_number = "0007"
 customer_number = "c <7>"
+condition = "worn & dry"
 
 [[person]]
 name = "Ada"
@@ -45,6 +46,7 @@ name = "Βύρων"
 
 [certificate]
 number = "2026-1"
+replaces = "2025-9"
 country = "CH"
 received = 2026-02-01
 begin = 2026-02-02

@@ -18,7 +18,9 @@ CHILDREN = {
     "softwareList": "(software )+",
     "software": "name release (type )?(description )?",
     "coreData": "countryCodeISO3166_1 (usedLangCodeISO639_1 )+(mandatoryLangCodeISO639_1 )+uniqueIdentifier "
-    "(identifications )?(receiptDate )?beginPerformanceDate endPerformanceDate performanceLocation (issueDate )?",
+    "(identifications )?(receiptDate )?beginPerformanceDate endPerformanceDate performanceLocation (issueDate )?"
+    "(reportAmendedSubstituted )?",
+    "reportAmendedSubstituted": "typeOfChange replacedUniqueIdentifier ",
     "items": "(item )+",
     "item": "name (description )?(manufacturer )?(model )?identifications ",
     "identifications": "(identification )+",
@@ -85,6 +87,8 @@ TEXTS = {
     "usedLangCodeISO639_1": "[a-z]{2}",
     "mandatoryLangCodeISO639_1": "[a-z]{2}",
     "uniqueIdentifier": _NOT_EMPTY,
+    "typeOfChange": "amended|substituted",
+    "replacedUniqueIdentifier": _NOT_EMPTY,
     "receiptDate": _DATE,
     "beginPerformanceDate": _DATE,
     "endPerformanceDate": _DATE,

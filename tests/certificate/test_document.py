@@ -132,14 +132,17 @@ def test_elements_are_in_the_order_of_the_schema(certificates, kind):
     assert [children(result) for result in root[1]][:2] == [parts.split()] * 2
     core = root[0].find(f"{DCC}coreData")
     dates = "beginPerformanceDate endPerformanceDate performanceLocation"
-    given = f"receiptDate {dates} issueDate" if kind in ("all stated", "hostile names") else dates
+    given = (
+        f"receiptDate {dates} issueDate reportAmendedSubstituted" if kind in ("all stated", "hostile names") else dates
+    )
     languages = "usedLangCodeISO639_1 mandatoryLangCodeISO639_1"
     assert core is not None
     assert children(core) == f"countryCodeISO3166_1 {languages} uniqueIdentifier {given}".split()
     found, left = (contents(certificates[kind], f"*/dcc:measurementResult[{n}]/dcc:results/*/dcc:name") for n in (1, 2))
     observations = kind == "observations"
     assert found == ["Repeatability", "Observations" if observations else "Reference lengths", PARAMETERS]
-    assert left == [*found, "Covariance matrix", *([] if observations else ["Scale"])]
+    later = ["Expanded uncertainty", "Covariance matrix", *([] if observations else ["Scale"])]
+    assert left == [*found, *later]
 
 
 def two_digits(found, value: float, expanded: float) -> None:
@@ -191,8 +194,9 @@ def test_numbers_read_back(record):
     assert [element.text for element in stated] == ["0.01"] * 2  # that of the first; the second is exact
     k = values["Calibrated parameters", "Scale", "k"]
     two_digits(k, record.k, uncertainty.expanded_k())
-    # Three metrics, three numbers for each of two lengths, and 27 parameters, twice; and the scale.
-    assert len(values) == 2 * (3 + 6 + 27) + 1
+    # Three metrics, three numbers for each of two lengths, and 27 parameters, twice; the scale; a length, and
+    # three statistics of tips and of such lengths, in both regions.
+    assert len(values) == 2 * (3 + 6 + 27) + 1 + 2 * 2 * 4
 
 
 @pytest.mark.slow
@@ -323,6 +327,40 @@ def test_observations_are_stated_with_what_is_certified_of_them(observed_record,
     assert "robust loss 'tukey'" in text
 
 
+def test_the_target_of_a_camera_has_its_size_and_the_u_of_its_scale():
+    corners = [[[100, 100], [200, 100], [100, 200], [200, 200]]]
+    points = [[[0, 0, 0], [30, 0, 0], [0, 40, 0], [30, 40, 0]]]
+    named = (0.3, "webcam", "board")
+    seen = aj.data.observations.Pixels(
+        "eye", [[0.1]], corners, points, [[0, 1, 2, 3]], *named, intrinsics=(600, 600, 320, 240), u_scale=1e-3
+    )
+    size = measurement_results._size(seen)
+    assert (size.values.tolist(), size.unit, size.u) == ([50.0], "mm", 0.05)
+
+
+@pytest.mark.slow
+def test_uncertainties_of_tips_and_lengths_are_those_over_the_working_volume(record, certificates):
+    values, volume = parse_dcc(certificates["nothing stated"]), aj.volumetric_uncertainty(aj.uncertainty_of(record))
+    for name, key in (("Tip position", "tip"), ("Measured length", "length_reading")):
+        stated = ("Calibrated parameters", "Expanded uncertainty", f"{name}, over all joint limits")
+        assert values[*stated, "length"].value == volume.length
+        for statistic, words in (("median", "median"), ("95", "95th percentile"), ("largest", "largest")):
+            expected = volume.summary[f"expanded_{key}_{statistic}_mm"]
+            assert values[*stated, words][:2] == (pytest.approx(expected, rel=0.05), MM)  # of two digits
+
+
+@pytest.mark.slow
+def test_held_out_poses_have_their_errors(record):
+    rows = aj.residuals_of(record).select(range(5))
+    values = parse_dcc(
+        dcc_xml(record._replace(held_out=rows._replace(use=("held out",) * 5)), AdministrativeData(), created=CREATED)
+    )
+    stated = ("Calibrated parameters", "Held-out poses")
+    assert values[*stated, "poses"].value == 5
+    assert values[*stated, "RMS distance"].value == pytest.approx(np.sqrt(np.mean(rows.distance**2)), abs=5.1e-6)
+    assert values[*stated, "largest distance"].value == pytest.approx(rows.distance.max(), abs=5.1e-6)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("value", [5e-324, -0.0, 1e-5, 0.1, 1 / 3, -123456789.125, 1e99])
 def test_any_number_reads_back(record, value):
@@ -418,6 +456,8 @@ def test_what_is_stated_is_in_the_certificate(certificates, full):
         ("coreData", "issueDate"): "2026-02-04",
         ("coreData", "performanceLocation"): "laboratory",
         ("items", "item", "name", "content"): 'arm "7"',
+        ("coreData", "reportAmendedSubstituted", "replacedUniqueIdentifier"): "2025-9",
+        ("items", "item", "description", "content"): "worn & dry",
         ("items", "item", "manufacturer", "name", "content"): "maker",
         ("items", "item", "model"): "X'1",
         ("items", "item", "identifications", "identification", "value"): "0007",

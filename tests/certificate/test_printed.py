@@ -7,11 +7,12 @@ import unicodedata
 import zlib
 from html.parser import HTMLParser
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.certificate import certificate_html, certificate_pdf, languages
+from aacmm_jax.certificate import languages, printed_certificate
 from tests.certificate import dcc_model
 from tests.certificate.conftest import KINDS
 from tests.refusals import assert_refused
@@ -47,6 +48,10 @@ class Texts(HTMLParser):
             self.texts.append(data.strip())
 
 
+def page(dcc: str, language: str) -> str:
+    return printed_certificate(dcc, language=language).html()
+
+
 def squeezed(text: str) -> str:
     """Without blanks, and with ligatures taken apart."""
     return re.sub(r"\s", "", unicodedata.normalize("NFKC", text))
@@ -66,10 +71,10 @@ ORDINARY = [kind for kind in KINDS if kind != "hostile names"]
 @pytest.mark.parametrize("kind", ORDINARY)
 def test_html_and_pdf_say_the_same_on_two_numbered_pages(certificates, read, kind, language):
     dcc = certificates[kind]
-    found = read(certificate_pdf(dcc, language=language, logo=SVG))
+    found = read(printed_certificate(dcc, language=language, logo=SVG).pdf())
     pages = [page.extract_text() for page in found.pages]
     assert len(pages) == 2
-    html = Texts(certificate_html(dcc, language=language, logo=SVG)).texts
+    html = Texts(printed_certificate(dcc, language=language, logo=SVG).html()).texts
     assert len(html) > 100
     assert [text for text in html if squeezed(text) not in squeezed("".join(pages))] == []
     number = re.search("<dcc:uniqueIdentifier>(.*)</dcc:uniqueIdentifier>", dcc)
@@ -84,19 +89,19 @@ def test_html_and_pdf_say_the_same_on_two_numbered_pages(certificates, read, kin
 def test_the_dcc_comes_out_of_the_pdf_as_it_went_in(certificates, read):
     """It is valid, and the PDF says that it is PDF/A-3, which may hold it."""
     dcc = certificates["all stated"]
-    pdf = certificate_pdf(dcc, logo=PNG)
+    pdf = printed_certificate(dcc, logo=PNG).pdf()
     attached = read(pdf).attachments
     assert list(attached) == ["dcc.xml"]
     assert attached["dcc.xml"] == [dcc.encode()]
     assert dcc_model.faults(attached["dcc.xml"][0].decode()) == []
     assert b"<pdfaid:part>3</pdfaid:part>" in pdf
-    assert certificate_pdf(dcc, logo=PNG) == pdf
+    assert printed_certificate(dcc, logo=PNG).pdf() == pdf
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ORDINARY)
 def test_every_printed_uncertainty_is_one_of_the_dcc(certificates, kind):
-    page = certificate_html(certificates[kind])
+    page = printed_certificate(certificates[kind]).html()
     printed = re.findall(r"(−?[\d.]+) ± ([\d.]+)", page)
     assert len(printed) > 5
     stated = re.compile(
@@ -109,24 +114,55 @@ def test_every_printed_uncertainty_is_one_of_the_dcc(certificates, kind):
 @pytest.mark.slow
 def test_what_a_laboratory_states_is_printed(certificates):
     """Identification, conditions, tests with limit and decision; German with its decimal sign."""
-    page = certificate_html(certificates["all stated"], language="de")
+    page = printed_certificate(certificates["all stated"], language="de").html()
     texts = Texts(page).texts
-    for text in ("Längenlabor <b>&amp; Söhne</b>", "X'1", "0007", "c <7>", "K 17", "house rule 1", "2026-02-04"):
+    stated = ("X'1", "0007", "c <7>", "worn & dry", "2025-9", "K 17", "house rule 1", "2026-02-04")
+    for text in ("Längenlabor <b>&amp; Söhne</b>", *stated):
         assert text in texts, text
-    assert "20,25\u00a0°C (u = 0,1\u00a0°C)" in texts
+    assert "20,25\u00a0°C\u00a0(u\u00a0=\u00a00,1\u00a0°C)" in texts
     assert {"b", "script"}.isdisjoint(Texts(page).tags)
     assert "Konformitätsaussage" in texts
     assert "unentschieden (innerhalb der Grenze)" in texts
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("kind", ORDINARY)
+def test_findings_are_printed_in_english_and_counted_in_other_languages(certificates, kind):
+    root, dcc_names = ElementTree.fromstring(certificates[kind]), {"dcc": "https://ptb.de/dcc"}
+    found = {
+        str(content.text).partition(". ")[0]
+        for statement in root.iterfind(".//dcc:statement", dcc_names)
+        if statement.findtext("dcc:name/dcc:content", "", dcc_names) in ("Warning", "Data left out")
+        for content in statement.iterfind("dcc:declaration/dcc:content", dcc_names)
+    }
+    english, german = (squeezed("".join(Texts(page(certificates[kind], code)).texts)) for code in ("en", "de"))
+    beginnings = [squeezed(sentence)[:80] for sentence in found]
+    assert sum(text in english for text in beginnings) == min(len(found), 4)
+    assert not any(text in german for text in beginnings)
+    assert ("HinweisederAuswertung" in german) == bool(found)
+
+
+def test_one_is_singular():
+    german = languages.language_of("de")
+    several = [german.counted("other observations", number) for number in ("1", "2")]
+    assert several == ["1 Beobachtung", "2 Beobachtungen"]
+
+
+@pytest.mark.slow
+def test_the_type_of_a_full_page_is_smaller_in_print(certificates):
+    printed = re.compile(r"\.results { font-size: ([\d.]+)pt")
+    sizes = [float(*printed.findall(page(certificates[kind], "en"))) for kind in ("nothing stated", "all stated")]
+    assert 6 < sizes[1] < sizes[0] <= 10
+
+
+@pytest.mark.slow
 def test_hostile_names_are_texts_in_both(certificates):
     """In the PDF, or it says that no font has them."""
-    page = Texts(certificate_html(certificates["hostile names"]))
+    page = Texts(printed_certificate(certificates["hostile names"]).html())
     assert "script" not in page.tags
     assert any("<script>alert" in text for text in page.texts)
     with contextlib.suppress(aj.InputError):
-        assert certificate_pdf(certificates["hostile names"]).startswith(b"%PDF")
+        assert printed_certificate(certificates["hostile names"]).pdf().startswith(b"%PDF")
 
 
 @pytest.mark.slow
@@ -135,17 +171,17 @@ def test_another_language_is_one_file(certificates, tmp_path):
     path = tmp_path / "fr.toml"
     french = english.replace('"en"', '"fr"').replace('"Calibration certificate"', '"Certificat d\'étalonnage"')
     path.write_text(french)
-    assert "Certificat d&#39;étalonnage" in certificate_html(certificates["joint"], language=path)
+    assert "Certificat d&#39;étalonnage" in printed_certificate(certificates["joint"], language=path).html()
     wrong = {
         french.replace('probe = "Probe"\n', ""): ["[labels] lacks 'probe'"],
         french.replace("[counts]", 'other = "x"\n[counts]'): ["[sentences] has the unknown key 'other'"],
-        french.replace("{count} more", "more"): ["needs the same names in braces"],
+        french.replace("{number} more", "more"): ["needs the same names in braces"],
         french.replace('"fr"', '"French"'): ["language code"],
     }
     for text, parts in wrong.items():
         path.write_text(text)
-        assert_refused(lambda: certificate_html(certificates["joint"], language=path), path, *parts)
-    assert_refused(lambda: certificate_html(certificates["joint"], language="fr"), "'fr'", "de or en")
+        assert_refused(lambda: printed_certificate(certificates["joint"], language=path).html(), path, *parts)
+    assert_refused(lambda: printed_certificate(certificates["joint"], language="fr").html(), "'fr'", "de or en")
 
 
 @pytest.mark.parametrize(
@@ -157,7 +193,7 @@ def test_another_language_is_one_file(certificates, tmp_path):
     ],
 )
 def test_what_is_no_certificate_is_not_printed(text, parts):
-    assert_refused(lambda: certificate_html(text), *parts)
+    assert_refused(lambda: printed_certificate(text).html(), *parts)
 
 
 def test_a_logo_is_a_small_png_or_svg_file(tmp_path):
@@ -177,9 +213,9 @@ def test_a_logo_is_a_small_png_or_svg_file(tmp_path):
     assert aj.files.read_logo(about) is None
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "damage", [b"<svg", b"<svg><g></svg>", SVG.replace(b"<rect", b'<image href="/etc/hostname"/><rect')]
 )
 def test_a_logo_that_cannot_be_drawn_or_names_a_file_is_one_sentence(certificates, damage):
-    assert_refused(lambda: certificate_pdf(certificates["joint"], logo=damage), "cannot be set as PDF")
+    assert_refused(lambda: printed_certificate(certificates["joint"], logo=damage).pdf(), "cannot be set as PDF")

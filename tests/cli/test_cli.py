@@ -97,6 +97,7 @@ def test_whole_path(aacmm, tmp_path):
         assert aacmm("show", file).stdout
 
 
+@pytest.mark.slow
 def test_not_converged_is_exit_code_1_and_still_written(aacmm, tmp_path, monkeypatch):
     """A solve that is stopped by its step limit has not converged."""
     aacmm(*SIMULATE)

@@ -37,7 +37,7 @@ def test_models_are_compared(aacmm, folder):
     assert found["models"][0]["rms_outside"] > found["models"][2]["rms_outside"]
     shown = aacmm(*command, "gear;dh", "--only-poses", 50).stdout
     assert "2 models on 50 poses, 12 regions held out in turn" in shown
-    assert "Recommended: gear" in shown
+    assert "gear is recommended" in shown
     assert "joint 3, upper half" in shown
 
 

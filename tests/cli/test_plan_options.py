@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.cli.plan_commands import arm_for
+from aacmm_jax.cli.plan_commands import _probe_axis, arm_for
 
 PLAN = (
     *("plan", "panda", "-o", "plan.csv", "--poses", 16, "--candidates", 120),
@@ -46,7 +46,7 @@ def test_cones_obstacles_and_radians(aacmm, tmp_path):
 
 @pytest.mark.slow
 def test_a_robot_by_default(aacmm):
-    """Cones of 60 deg, approach points 50 mm above, the noise of its data sheet; no obstacles unless asked for."""
+    """Cones of 55 deg, approach points 50 mm above, the noise of its data sheet; no obstacles unless asked for."""
     printed = " ".join(aacmm(*PLAN, "--collisions").stdout.split())
     for text in (
         "noise of 9.04 arcsec (encoders)",
@@ -57,7 +57,15 @@ def test_a_robot_by_default(aacmm):
         "Note: every link is assumed to be a capsule with a radius of 60 mm",
     ):
         assert text in printed
-    assert "60" in printed.split("largest tilt [deg]")[1].split("Reference")[0]
+    assert "Limits: tool (axis z of the last frame) within 55 deg of the socket normal (--cone-deg)." in printed
+    assert "55" in printed.split("largest tilt [deg]")[1].split("Reference")[0]
+
+
+@pytest.mark.parametrize(
+    ("probe", "axis"), [((0, 0, 102), "z"), ((0, 0, 0), "z"), ((-90, 5, 40), "-x"), ((0, 9, 8), "y")]
+)
+def test_a_measuring_arm_points_along_its_probe(paper_arm, probe, axis):
+    assert _probe_axis(paper_arm.replace(probe=np.array(probe, dtype=float))) == axis
 
 
 @pytest.mark.first_rows(2)

@@ -257,6 +257,7 @@ REFUSED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("arguments", "said"), REFUSED, ids=lambda value: value[-1])
 def test_options_are_refused_before_any_work(run, tmp_path, arguments, said):
     (tmp_path / "there.h5").touch()

@@ -40,6 +40,7 @@ def test_derivative(vectors):
             np.testing.assert_allclose(rotation_and_derivative(w)[1][:, k], numerical, atol=1e-8)
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("library", [np, jnp], ids=["numpy", "jax"])
 def test_vectors_that_are_columns(vectors, library):
     """One matrix each, of many vectors at once as of one."""

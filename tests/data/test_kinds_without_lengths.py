@@ -24,7 +24,7 @@ from aacmm_jax.data.observations.measured import AbstractInBox
 from aacmm_jax.data.observations.observation import FRAME, AbstractObservation, Rows
 from aacmm_jax.data.observations.simulated import OTHER_KINDS
 from aacmm_jax.files import manifest, manifest_tables
-from tests.conftest import command_line
+from tests.conftest import SLOW, command_line
 
 from .test_observations import POSES, TIPS, Q, check_derivatives, columns
 
@@ -177,7 +177,7 @@ def recording(kind, paper_arm):
     return aj.Recording(capture, nominal, true=nominal._replace(arm=true))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", params=SLOW)
 def files(recording, kind, tmp_path_factory):
     """Captures of that arm to calibrate from and to evaluate with; what the calibration prints, and its ``--json``."""
     folder = tmp_path_factory.mktemp(kind)

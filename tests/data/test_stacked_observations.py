@@ -149,6 +149,7 @@ def test_derivatives_are_those_of_jax(name):
     np.testing.assert_allclose(one.measured[1], rows.measured, atol=1e-12)
 
 
+@pytest.mark.first_rows(17)
 @pytest.mark.parametrize("name", ALL)
 def test_what_is_linear_has_derivatives_that_depend_on_nothing(name):
     observation = to_numpy(ALL[name])

@@ -23,6 +23,7 @@ def poses(kind, arm, count, random):
     return q
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("arm", ARMS)
 @pytest.mark.parametrize(
     ("kind", "count"), [("all", 3), ("all", 4), ("small", 4), ("wrist", 5), ("wrist", 30), ("oriented", 3)]

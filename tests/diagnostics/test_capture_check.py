@@ -47,6 +47,7 @@ def test_full_couplings_are_found(couplings, seen_by):
     assert search_couplings(*recorded(couplings, seen_by)) == couplings
 
 
+@pytest.mark.slow
 def test_couplings_that_the_data_do_not_show_are_not_named(monkeypatch):
     """Half of a reading is no mechanism; and of readings that belong to no arm, none explains anything."""
     assert search_couplings(*recorded({"coupled2_3": -0.5}, "sockets")) == {}
@@ -91,7 +92,7 @@ def test_a_coupling_beside_other_mistakes(monkeypatch, mistake):
     assert "In addition, " in sentence
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [None, "coupled=2-3", pytest.param("dh", marks=pytest.mark.slow)])
 def test_a_calibration_sets_them_unless_a_model_without_them_is_stated(model):
     """Its mean is 1 or -1, so that the prior of small couplings does not pull to 0, and what it really is is found."""
@@ -132,7 +133,7 @@ MISREAD = {
 }
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("on_arm", [True, False])
 def test_readings_fit_what_a_camera_saw_or_do_not(on_arm):
     nominal, eye = photographed(on_arm)

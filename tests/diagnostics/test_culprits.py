@@ -85,6 +85,7 @@ def test_the_cause_stands_first(paper_arm, capture, errors, code, concerns, word
     assert [finding.code for finding in others if finding.severity != "note"] == []
 
 
+@pytest.mark.slow
 def test_a_sound_capture_has_no_cause(paper_arm, capture):
     nominal = ArmSpecification(paper_arm, "test")
     record = aj.calibrate_capture(aj.Recording(capture, nominal), automatic=False, cross_validate=False)
@@ -92,7 +93,7 @@ def test_a_sound_capture_has_no_cause(paper_arm, capture):
     assert [finding for finding in findings_of(record) if finding.severity != "note"] == []
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["two-stage", "joint"])
 def test_a_parameter_that_is_fixed_at_a_wrong_value(paper_arm, capture, method):
     """An angle shows in the poses; a length that is fixed sets the scale of sockets."""
@@ -106,7 +107,7 @@ def test_a_parameter_that_is_fixed_at_a_wrong_value(paper_arm, capture, method):
     assert "--free alpha_3" in first.advice
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("stated", [(), ("parameters",)])
 def test_it_is_freed_where_nobody_stated_that_it_is_fixed(paper_arm, capture, stated):
     held = (*aj.Parameters.free_of(paper_arm).held, "alpha_3")
@@ -121,6 +122,7 @@ def test_it_is_freed_where_nobody_stated_that_it_is_fixed(paper_arm, capture, st
     )
 
 
+@pytest.mark.slow
 def test_a_wrong_length_is_fixed(paper_arm, capture):
     held = (*aj.Parameters.free_of(paper_arm).held, "a_2")
     longer = paper_arm.replace(a_2=float(paper_arm.a[1]) + 1.0)
@@ -130,6 +132,7 @@ def test_a_wrong_length_is_fixed(paper_arm, capture):
     assert (first.code, first.severity, first.concerns) == ("scale-set-by-fixed-lengths", "doubt", ("a_2",))
 
 
+@pytest.mark.slow
 def test_one_of_two_lengths_is_mistyped(paper_arm):
     """The poses agree, so that no compliance is to be suspected."""
     drawn = aj.simulate(paper_arm, SOCKETS, poses=20, lengths=LENGTHS[:2], noise=NOISE, seed=3)

@@ -50,6 +50,7 @@ def test_ratios_are_those_of_two_whole_least_squares():
     assert worst.ratio == pytest.approx((cost - rest_cost) / (degrees_of_freedom - spare) / (rest_cost / spare))
 
 
+@pytest.mark.slow
 def test_level():
     rng = np.random.default_rng(1)
     found = sum(bool(found_in(problem(rng, (6, 2, 9, 1, 12)), level=0.05)) for _ in range(400))

@@ -57,6 +57,7 @@ def test_words(order, signs, offsets, units, words):
     assert bool(said) == bool(words)
 
 
+@pytest.mark.slow
 def test_a_capture_of_a_tracker_and_what_cannot_be_checked(paper_arm, monkeypatch):
     monkeypatch.setattr(reading_search, "_MOST", 20_000)
     monkeypatch.setattr(reading_check, "_REFITTED", 6)

@@ -30,7 +30,7 @@ def record_of(arm, capture, factor=1.0, u=1.0, wrong=(), automatic=False):
     return aj.calibrate_capture(recording, automatic=automatic, cross_validate=False)
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.99, 1.0, 1.006])
 def test_a_wrong_scale_is_seen_in_all_lengths_of_the_arm(paper_arm, capture, factor):
     record = record_of(paper_arm, capture, factor)
@@ -57,6 +57,7 @@ def test_no_model_is_taken_to_please_a_mistyped_length(paper_arm, capture):
     assert not record.decisions
 
 
+@pytest.mark.slow
 def test_bounds_that_explain_most_stand_before_their_imitations(paper_arm, capture):
     off = paper_arm.replace(theta=np.asarray(paper_arm.theta) + 0.004 * (np.arange(6) == 2))
     nominal = ArmSpecification(off, "test", override={"theta_3": 1e-3})
@@ -66,7 +67,7 @@ def test_bounds_that_explain_most_stand_before_their_imitations(paper_arm, captu
     assert first.explains > 0.9
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(("other", "u", "names"), [(0.02, 0.2, ("near", "far")), (0.2, 0.02, ()), (0.02, 0.02, ())])
 def test_an_instrument_that_agrees_far_better_than_stated(paper_arm, other, u, names):
     """A second one that is far worse than it should be makes the first one no better."""

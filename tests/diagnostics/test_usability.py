@@ -57,7 +57,7 @@ def made(readings, changed, stated=None):
     return aj.calibrate_capture(recording, automatic=False, cross_validate=False)
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("changed", "stated", "severity", "reason"),
     [
@@ -81,6 +81,7 @@ def test_reasons(readings, changed, stated, severity, reason):
         assert ("Check the columns" in finding.sentence) == (changed in (wrong_sign, wrong_zero))
 
 
+@pytest.mark.slow
 def test_what_was_stated_never_condemns(paper_arm, readings):
     """Points of a poor instrument: residuals of 8 mm RMS are within a stated u of 5 mm a coordinate."""
     q = np.concatenate(list(readings.values()))
@@ -104,6 +105,7 @@ def test_a_scale_that_is_not_plausible_is_not_said_to_have_converged(readings):
     assert why_unusable(record) == "the reference lengths give an implausible scale"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("moved", "says"), [((0, 1), "joints 3, 4, 5 and 6"), ((0, 1, 2, 4, 5), "joint 4"), (range(6), "")]
 )

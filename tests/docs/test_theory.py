@@ -30,6 +30,7 @@ def test_a_link_to_the_source_names_a_function(target):
     assert callable(source_links.function_of(target))
 
 
+@pytest.mark.first_rows(2)
 @pytest.mark.parametrize(
     ("formula", "observation", "unknowns", "expected"),
     [

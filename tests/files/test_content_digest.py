@@ -66,6 +66,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.first_rows(13)
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
 def test_changed_content_is_refused(path, change):
     changed(path, change)

@@ -590,7 +590,9 @@ def test_what_is_stated_of_the_readings(tmp_path, motion, angles, socket, stated
     recording = aj.files.read_manifest(tmp_path / "capture.toml")
     assert recording.stated == stated
     aj.files.save_capture(tmp_path / "capture.h5", recording)
-    assert aj.files.load_capture(tmp_path / "capture.h5").stated == stated
+    again = aj.files.load_capture(tmp_path / "capture.h5")
+    assert again.stated == stated
+    assert again.read_as == ((1, 2, 3, 4, 5, 6) if "sign" in stated else None)
 
 
 def test_the_time_of_day_of_a_date_is_left_out(tmp_path, motion):

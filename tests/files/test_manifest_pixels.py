@@ -94,7 +94,7 @@ def test_a_column_divides_the_images_into_groups(tmp_path, seen):
     assert [part.name for part in kept.observations] == ["webcam/left"]
 
 
-@pytest.mark.first_rows(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("lists", ["all", "ids", "points", "plain", "records"])
 def test_nested_lists(tmp_path, seen, lists):
     files(tmp_path, seen, images=False)

@@ -160,6 +160,7 @@ def test_one_zero_offset_changes_one_body(change):
     assert_same(poses(read(exported.text, "tool")), poses(nominal, arm))
 
 
+@pytest.mark.slow
 def test_a_tool_is_a_site_beside_the_tip():
     """Of a site that is the tip, and of a body without elements, which gets an end tag."""
     text = TEXT.replace('<body name="flange" pos="0 0 0.05"><geom/></body>', '<body name="flange" pos="0 0 0.05"/>')

@@ -117,6 +117,7 @@ def test_some_poses_of_an_observation(kind):
     assert some.unknowns.keys() == one.unknowns.keys() - left_out  # of contacts, sockets of poses that are left out
 
 
+@pytest.mark.slow
 def test_xarray_reads_the_table(tmp_path):
     xarray = pytest.importorskip("xarray")
     draw = np.random.default_rng(0)

@@ -100,7 +100,7 @@ def test_a_child_that_has_ended_is_replaced(path):
     assert first.stdin.closed
 
 
-@pytest.mark.first_rows(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("executable", "reason"),
     [("/no/such/program", "no such file"), (shutil.which("false"), "exit status 1")],

@@ -21,7 +21,7 @@ def files(tmp_path_factory, paper_arm, noisy_capture):
     return folder
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("kind", "name", "value", "said"),
     [

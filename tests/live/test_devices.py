@@ -77,6 +77,7 @@ def test_a_simulated_arm_is_the_same_for_the_same_seed_and_rests_in_its_seat():
     assert held.std(axis=0).max() > 3 * device.encoder.max()
 
 
+@pytest.mark.slow
 def test_a_simulated_operator_makes_mistakes():
     device = aj.live.open_device("simulated:?seed=3&speed=1000&bad=0.5&off=2", SETUP)
     off = []
@@ -181,6 +182,7 @@ distance = [250, 500]
 """
 
 
+@pytest.mark.slow
 def test_a_camera_finds_the_target_of_a_kit(tmp_path):
     cv2 = pytest.importorskip("cv2")
     kit = tmp_path / "kit.toml"

@@ -1,6 +1,7 @@
 """Guidance: fewer poses than random ones need, outliers named and taken again, what limits U."""
 
 import itertools
+import re
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -182,6 +183,8 @@ def test_poses_that_were_skipped_are_not_proposed_again() -> None:
             assert asked is not None
             near = [pose for pose in skipped if pose.place == asked.place and guide.search.away(pose.q, asked.q) < 0.1]
             assert near == []
+            says = r"take it again|tells most about (joint \d|the probe): the uncertainty of \w+ falls by \d+ %"
+            assert re.search(says, asked.why)
             skipped.append(asked)
     assert wrong is not None
     assert wrong.again is not None

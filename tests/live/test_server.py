@@ -295,6 +295,7 @@ def hostile(rng: random.Random) -> tuple[bytes, dict[str, str | None]]:
     return body, headers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [200, pytest.param(10_000, marks=pytest.mark.exhaustive)])
 def test_hostile_messages_are_not_obeyed_and_leave_nothing(served, monkeypatch, count):
     monkeypatch.setattr(messages, "_A_SECOND", 1e9)  # or most would be refused for their number alone

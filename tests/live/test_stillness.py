@@ -46,6 +46,7 @@ def visits(
     return path + shaken + ENCODER * random.normal(size=path.shape), begins
 
 
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     "tremor", [3.0, pytest.param(10.0, marks=pytest.mark.slow), pytest.param(30.0, marks=pytest.mark.slow)]
 )

@@ -63,6 +63,7 @@ def dense(linear, loss=None):
 PARTS = st.lists(st.sampled_from(sorted(EVERY)), max_size=4)
 
 
+@pytest.mark.slow
 @settings(max_examples=example_count(3), deadline=None)
 @given(PARTS, st.integers(0, 1000))
 def test_the_arrow_is_the_dense_normal_matrix(paper_arm, parts, seed):
@@ -188,6 +189,7 @@ def test_observations_that_several_use_are_shared(paper_arm):
     assert (4, 5) in groups  # both stations at once
 
 
+@pytest.mark.slow
 def test_groups_do_not_change_the_rows(paper_arm):
     """Sockets evaluated at once and one by one."""
     linear = problem(paper_arm, [], 2)

@@ -21,6 +21,7 @@ def test_tuning_constants_of_one_row_are_the_published_ones(name, constant):
     assert tuning_constant(name, 1) == constant
 
 
+@pytest.mark.first_rows(12)
 @pytest.mark.parametrize("rows", [1, 2, 3, 4, 6])
 @pytest.mark.parametrize("name", LOSSES)
 def test_tuning_constants_give_95_percent(name, rows):

@@ -33,7 +33,7 @@ def imported(folder, line=""):
     return aj.files.read_manifest(folder / "capture.toml")
 
 
-@pytest.mark.first_rows(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("there", [False, True])
 def test_columns(folder, there, capsys):
     recording = imported(folder, 'as_found = "installed.toml"\n' if there else "")
@@ -74,6 +74,7 @@ def test_another_arm_is_refused(folder):
     assert_refused(lambda: imported(folder, 'as_found = "so100"\n'), "as_found", "5 joints", "6")
 
 
+@pytest.mark.slow
 def test_a_report_without_tests_states_no_conformity(folder):
     record = aj.calibrate_capture(imported(folder), automatic=False, cross_validate=False)
     aj.files.save_calibration(folder / "k.h5", record)

@@ -25,6 +25,7 @@ def record(recording):
     return aj.calibrate_capture(recording, cross_validate=False, shared_errors=False)
 
 
+@pytest.mark.slow
 def test_data_are_chosen_by_name(record, recording):
     chosen = aj.evaluate_capture(record, recording, only="A", measuring_range=None).recording
     assert (chosen.capture.names, chosen.capture.lengths) == (("A",), ())

@@ -48,6 +48,7 @@ def errors(record, true):
     return [float(np.sqrt(np.mean((values - lengths) ** 2))) for values in measured.values()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "count", "ratio"), [("ur10e", 5, 0.9), ("ur10e", 8, 0.4), ("irb120", 8, 0.4)])
 def test_too_few_points_have_a_prior(name, count, ratio):
     recording, true = recorded(name, count)
@@ -62,6 +63,7 @@ def test_too_few_points_have_a_prior(name, count, ratio):
     assert record.given_noise is not None
 
 
+@pytest.mark.slow
 def test_what_is_stated_stays():
     recording, _ = recorded("ur10e", 8)
     with pytest.raises(aj.InputError, match="equations"):
@@ -115,6 +117,8 @@ def test_wrong_readings_are_corrected(mistake, says):
     assert record.converged
     assert not record.implausible_residual
     assert says in record.decisions[0]
+    read_as = {exchanged: (1, 3, 2, 4, 5, 6), turned: (1, 2, -3, 4, 5, 6)}.get(mistake, (1, 2, 3, 4, 5, 6))
+    assert record.recording.read_as == read_as
     if mistake is shifted:  # the calibrated arm holds the zero, with the readings as they are
         q = np.asarray(record.recording.capture.observations[0].q)
         assert np.array_equal(q, recording.capture.observations[0].q)

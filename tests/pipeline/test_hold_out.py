@@ -66,6 +66,7 @@ def test_impossible_shares_and_groups_are_refused(arms, options, words):
     assert all(word in str(error.value) for word in words), error.value
 
 
+@pytest.mark.slow
 def test_every_pose_is_listed_once_under_its_own_number(arms):
     rows = aj.residuals_of(calibrated(arms, hold_out=0.3))
     listed = list(zip(rows.observation, rows.pose.tolist(), strict=True))
@@ -74,6 +75,7 @@ def test_every_pose_is_listed_once_under_its_own_number(arms):
     assert np.allclose(np.linalg.norm(rows.residual, axis=1), rows.distance)
 
 
+@pytest.mark.slow
 def test_held_out_poses_are_compared_with_the_position_that_the_others_have(arms):
     record = calibrated(arms, hold_out=0.3)
     rows = aj.residuals_of(record)
@@ -85,7 +87,7 @@ def test_held_out_poses_are_compared_with_the_position_that_the_others_have(arms
         assert np.allclose(tips - position, rows.residual[of_socket], atol=1e-9)
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["two-stage", "joint"])
 @pytest.mark.parametrize("hold_out", [0.3, "b"])
 def test_distances_are_as_large_as_predicted(arms, method, hold_out):
@@ -99,6 +101,7 @@ def test_distances_are_as_large_as_predicted(arms, method, hold_out):
         assert np.sqrt(np.mean(ratios)) == pytest.approx(1, abs=0.13)
 
 
+@pytest.mark.slow
 def test_points_of_a_tracker_keep_the_frame_of_the_station(arms):
     squares = []
     for seed in range(3):
@@ -110,6 +113,7 @@ def test_points_of_a_tracker_keep_the_frame_of_the_station(arms):
     assert np.sqrt(np.mean(squares)) == pytest.approx(1, abs=0.15)
 
 
+@pytest.mark.slow
 def test_a_group_that_was_held_out_tests_the_uncertainty(arms):
     record = calibrated(arms, hold_out="b", method="joint")
     assert record.validation is not None
@@ -120,6 +124,7 @@ def test_a_group_that_was_held_out_tests_the_uncertainty(arms):
     assert group.rms == pytest.approx(np.sqrt(np.mean(rows.distance**2)), rel=0.02)
 
 
+@pytest.mark.slow
 def test_held_out_residuals_are_kept_in_the_file(arms, tmp_path):
     record = calibrated(arms, hold_out=0.3)
     aj.files.save_calibration(tmp_path / "c.h5", record)

@@ -176,7 +176,7 @@ def test_regions_exclude_and_evidence_decides_among_the_others(squares, evidence
     assert ComparedModels(models).recommended.model == expected
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(("outside", "taken"), [(0.99, True), (1.02, True), (1.05, False)])
 def test_a_model_that_predicts_worse_is_not_taken_by_default(monkeypatch, paper_arm, space, outside, taken):
     """However probable it makes the measurements: three regions cannot tell it from the arm alone."""

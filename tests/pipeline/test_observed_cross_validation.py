@@ -103,7 +103,7 @@ def test_a_recording_that_the_user_has_divided_is_held_out_as_divided():
     assert held_out(13) == []
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("kind", SIMULATED)
 def test_some_poses_of_an_observation(paper_arm, kind):
     """Residuals of the poses that remain are what they were."""

@@ -26,7 +26,7 @@ def recordings():
     }
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("taken", ["commanded", "measured"])
 def test_the_better_ones_are_named(recordings, taken):
     record = aj.calibrate_capture(recordings[taken], model="dh", cross_validate=False)

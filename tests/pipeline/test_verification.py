@@ -6,7 +6,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.kinematics.parameters import ArmSpecification
 from aacmm_jax.pipeline.verification import MARGIN, _paired, _Rows
-from aacmm_jax.summaries.verification import verification_summary
+from aacmm_jax.summaries.verification import verification, verification_summary
 
 PROBE = np.array([20.0, -40.0, 120.0])
 NAMES = tuple(f"{kind}_{i}" for kind in ("a", "d", "theta", "alpha") for i in range(1, 7))
@@ -31,7 +31,7 @@ def recording(nominal, true, poses=8, lengths=(), sockets="ABC"):
     )
 
 
-@pytest.mark.first_rows(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("true", "other", "verdict"),
     [(1.0, 0.2, "better"), (1.0, 0.0, "better"), (-1.0, 0.0, "worse"), (0.0, 4.0, "worse"), (0.5, 0.8, "equivalent")],
@@ -114,6 +114,11 @@ def test_the_same_parameters_are_said_to_be_the_same():
     nominal, real, _ = arms(4, 1.0, 0.0)
     checked = aj.verify(recording(nominal, real), nominal)
     assert (checked.same, checked.verdict, checked.decided_by) == (True, "not decided", None)
+    summary = verification_summary(checked, "arm", "arm")
+    said = " ".join(str(line) for line in verification(summary))
+    assert summary["share"] == {"value": None, "lower": None, "upper": None}
+    assert summary["says"].startswith("No difference: in these poses")
+    assert not any(text in said for text in ("inf", "times as much", "Real share"))
 
 
 def drawn(random: np.random.Generator, share: float, clusters: int = 12) -> tuple[_Rows, _Rows]:
@@ -142,6 +147,7 @@ def test_the_standard_error_is_that_of_leaving_out_each_pose():
     assert found.u == pytest.approx(np.sqrt(11 / 12 * np.sum((np.array(shares) - whole) ** 2)))
 
 
+@pytest.mark.slow
 def test_equally_good_parameters_are_told_apart_as_rarely_as_stated():
     random = np.random.default_rng(1)
     decided = [_paired(*drawn(random, 0.5)).verdict != "not decided" for _ in range(400)]

@@ -216,7 +216,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize("case", REFUSED)
 def test_refused(panda, case):
     options, text = REFUSED[case]

@@ -12,6 +12,7 @@ from aacmm_jax.files.plans import plan_csv, plan_manifest, save_plan
 from aacmm_jax.planning import placement as placements
 from aacmm_jax.planning.designs import Candidates, Objective, covariance_of, exchange, relaxed_value
 from aacmm_jax.planning.problem import DesignProblem, PlanOptions
+from aacmm_jax.summaries.planning import plan as view
 from aacmm_jax.summaries.planning import plan_summary
 
 FUNCTIONS = np.random.default_rng(5).normal(size=(12, 3))
@@ -182,6 +183,7 @@ def test_placements_are_in_the_region_and_the_range(paper_arm, quick):
     assert all(0 <= fraction <= 1 for _, fraction in reported)
 
 
+@pytest.mark.slow
 def test_placements_keep_off_the_end_of_the_reach(paper_arm):
     """By default off the last 5 %, in whatever ranges are given."""
     reach = aj.kinematics.arm_reach(paper_arm)
@@ -195,10 +197,32 @@ def test_placements_keep_off_the_end_of_the_reach(paper_arm):
     assert inspect.signature(aj.planning.plan_kit).parameters["farthest"].default == defaults
 
 
+@pytest.mark.parametrize(
+    ("options", "z"),
+    [
+        ({}, (20, 1000)),
+        ({"above": -400.0}, (-380, 600)),
+        ({"above": -np.inf}, (-np.inf, np.inf)),
+        ({"region": {"x": (0.0, 500.0)}}, (20, 1000)),
+        ({"region": {"z": (0.0, np.inf)}}, (0, np.inf)),
+    ],
+)
+def test_by_default_what_is_placed_is_between_the_table_and_a_hand(options, z):
+    assert PlanOptions(**options).ranges["z"] == z
+
+
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_plan(paper_arm, quick):
-    one, other = (aj.planning.plan(paper_arm, sockets=2, poses=12, candidates=200, seed=3) for _ in range(2))
+    """And keeps to the usual heights, at a cost that it states."""
+    options = {"sockets": 2, "poses": 12, "candidates": 200, "seed": 3}
+    one, other = (aj.planning.plan(paper_arm, **options, unconstrained=number == 1) for number in range(2))
     np.testing.assert_array_equal(one.q, other.q)
+    assert all(20 <= z <= 1000 for *_, z in one.sockets.values())
+    assert other.unconstrained.largest <= other.predicted.largest
+    printed = [" ".join(str(line) for line in view(plan_summary(found, "an arm"))) for found in (one, other)]
+    assert "Limits: sockets at z from 20 mm to 1000 mm (--region). To see what these limits cost" in printed[0]
+    assert "12 poses planned without limits of height, direction, obstacles and approach points" in printed[1]
+    assert "To see what" not in printed[1]
 
 
 @pytest.mark.slow
@@ -259,7 +283,8 @@ REFUSED = {
     ),
     "beyond the reach": ({"farthest": 1.2}, "farthest is 1.2; it must be"),
     "no range": ({"region": {"z": (10.0, 0.0)}}, "which is not a range"),
-    "under the table": ({"above": 2000.0}, "reaches all sockets"),
+    "under the table": ({"above": 2000.0, "region": {"z": (0.0, np.inf)}}, "reaches all sockets"),
+    "high table": ({"above": 3000.0}, "no placement of the sockets.*z from 3020 to 4000 mm"),
     "no length": (
         {"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}},
         "cannot determine all parameters.*the scale",
@@ -272,6 +297,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.first_rows(5)
 @pytest.mark.parametrize("case", REFUSED)
 def test_refused(paper_arm, quick, case):
     options, text = REFUSED[case]

@@ -10,6 +10,7 @@ from aacmm_jax.planning import first_capture as planned
 from aacmm_jax.planning.first_capture import determined_by, first_capture, still_joints
 
 
+@pytest.mark.slow
 def test_numbers_of_determined_parameters(paper_arm):
     """METROLOGY: 27 by positions for six revolute joints, 21 without the base, 20 without the scale."""
     sockets, length, tracker, target = determined_by(paper_arm).values()
@@ -18,6 +19,7 @@ def test_numbers_of_determined_parameters(paper_arm):
     assert any("the scale" in text for text in sockets.undetermined)
 
 
+@pytest.mark.slow
 def test_a_still_first_joint_hides_the_link_after_it(paper_arm):
     still = still_joints(paper_arm)
     assert {"a_1", "alpha_1"} <= set(still[0])

@@ -197,7 +197,7 @@ def bar(**options):
     return KitItem(simulated, **options)
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("item", "options", "text"),
     [

@@ -31,6 +31,7 @@ def configurations(robot: aj.Arm, count: int) -> np.ndarray:
     return np.column_stack([q, np.arange(count) % 2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", [TWO, TORSO], ids=["two bases", "torso"])
 def test_the_body_is_that_of_each_chain_wherever_the_others_are(robot):
     body, q = aj.kinematics.body_along_links(robot, 15.0), configurations(robot, 6)
@@ -62,6 +63,7 @@ def test_an_arm_at_rest_is_in_the_way():
     np.testing.assert_array_equal(q[:, 9:], starts[:, 9:])  # the other arm stays where it was
 
 
+@pytest.mark.slow
 def test_random_configurations_are_of_the_chains_asked_for_and_leave_the_others_at_rest():
     rest = np.full(TWO.joints, 0.2)
     problem = DesignProblem.of(TWO, PlanOptions(chains=("right",), rest=rest))

@@ -9,6 +9,7 @@ import aacmm_jax as aj
 from tests.data.test_contacts import TORSO, TWO
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", [TORSO, TWO], ids=["torso", "two bases"])
 def test_every_chain_and_every_axis_is_drawn_once(robot, tmp_path):
     axes = aj.plot.arm_at_zero(robot)

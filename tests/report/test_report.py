@@ -17,8 +17,8 @@ from aacmm_jax.data.recording import ReadImage
 from aacmm_jax.diagnostics.joint_travel import tried_poses
 from aacmm_jax.plot import charts, svg
 from aacmm_jax.plot.lengths import tried_shades
-from aacmm_jax.report import elements, write_report
-from aacmm_jax.report.html_page import _origin
+from aacmm_jax.report import elements, plans, write_report
+from aacmm_jax.report.html_page import _identity, _origin
 from aacmm_jax.summaries.tables import Table, decimals_for, format_number, number
 from tests.conftest import SLOW
 from tests.refusals import assert_refused
@@ -356,7 +356,10 @@ def test_a_report_says_what_was_left_out(observed_record):
     (row,) = removed_tables(record)[0].cells
     expected = ["T2", "station", "T2/day, T2/night", "45.6", "6 and 60", "< 0.0001", "0.2000", "0.1000"]
     assert [cell.text for cell in row] == [*expected, "theta_3, by 12.0 u"]
-    assert removal(record.removed[0]).says.startswith("Left out: station T2")
+    assert "Left out: station T2, which contradicts the other data (F = 45.6 with 6 and" in removal(removed).says
+    clear = removed._replace(ratio=5.74e9)
+    assert removed_tables(record._replace(removed=(clear,)))[0].cells[0][3].text == "> 1000"
+    assert "(F > 1000 with 6 and 60 degrees of freedom" in removal(clear).says
 
 
 @pytest.mark.slow
@@ -371,10 +374,10 @@ def test_groups_held_out_are_listed_one_by_one_the_worst_first(written):
     tables = tables_of(calibration_report(written.record._replace(validation=CrossValidation(groups))))
     rows = tables["Groups held out [mm]"].rows
     assert rows[0][0].text.startswith("high")
-    assert [cell.value for cell in rows[0][1:5]] == pytest.approx([10, 1.17, 0.31, 0.025 * math.sqrt(2)])
-    assert [row[-1].text for row in rows] == ["disagrees", "", ""]
+    assert [cell.value for cell in rows[0][2:6]] == pytest.approx([10, 1.17, 0.31, 0.025 * math.sqrt(2)])
+    assert [row[1].text for row in rows] == ["disagrees", "", ""]
     (unknown,) = (row for row in rows if row[0].text.startswith("open"))
-    assert unknown[3].text == "–"
+    assert unknown[4].text == "–"
 
 
 @pytest.mark.slow
@@ -609,6 +612,18 @@ def test_marks_stand_where_their_numbers_say():
     assert 'd="M250 500h0M750 0h0"' in drawn
     assert svg.points(plot) == [[250, 500, "a"], [750, 0, "c"]]
     assert '<text x="50.00%" y="100%"' in drawn
+
+
+def test_long_names_of_an_axis_have_room():
+    """Slanted to the left of their ticks, without their middle, however long they are."""
+    names = [f"measuring_station_{i}/nest" for i in range(3)]
+    plot = charts.Plot(charts.names("", names), charts.linear("y", [0, 1]), ())
+    drawn = svg.drawn(plot, "caption")
+    assert [words in drawn for words in ("measuring_…on_0/nest", *names)] == [True, False, False, False]
+    below, left = map(float, re.search(r"padding:6px 12px ([\d.]+)px ([\d.]+)px", drawn).groups())
+    assert below < 150  # pixels
+    across = 0.5 * 6.6 * len("measuring_…on_0/nest")  # pixels, of the first name
+    assert left + 280 * plot.x.at(0.0) > across  # on a telephone
 
 
 def test_lengths_stand_placement_by_placement():
@@ -887,9 +902,44 @@ def test_a_plan_has_a_page_for_the_machine(tmp_path, paper_arm):
     assert [thing["kind"] for thing in scene["things"]] == ["bar"]
 
 
+def test_the_page_of_an_acceptance_test_has_no_files_that_are_called_as_their_ends():
+    headings, row = "pose,test,name,file,x_mm,probe_direction_x", "1,length error,bar1/a,{},1.5,0.1"
+    for file, expected in (("bar1/a.csv", []), ("a.csv", ["file"])):
+        table = plans._table(f"{headings}\n{row.format(file)}")
+        assert table.headings == ["done", "pose", "test", "name", *expected, "x [mm]"]
+
+
+@pytest.mark.parametrize(
+    ("measured", "given", "expected"),
+    [
+        ("", None, "calculated on 2026-01-31"),
+        ("2025-06-30", None, "measured on 2025-06-30"),
+        ("2025-06-30", {"item": {"serial_number": "7"}}, "measured on 2025-06-30; serial number 7"),
+    ],
+)
+def test_the_first_page_says_of_what_and_when(measured, given, expected):
+    given = given and aj.files.AdministrativeData.model_validate(given)
+    assert _identity({"created": "2026-01-31T10:00:00+00:00", "measured": measured}, given) == expected
+
+
+@pytest.mark.parametrize("bars", [8, 9])
+def test_of_many_bars_the_view_shows_one_at_a_time(paper_arm, bars):
+    """It knows the bar by the names of its ends, and of each pose the end that it is at."""
+    sockets = {f"{bar}{end}": np.full((1, 6), 0.1 * bar + 0.01 * (end == "b")) for bar in range(bars) for end in "ab"}
+    lengths = [aj.ReferenceLength(f"{bar}a", f"{bar}b", 10.0, 0.002) for bar in range(bars)]
+    view = elements.view_of_arm(paper_arm, aj.Capture(sockets, lengths))
+    ends, marks = ([part.get(key) for part in view.data[of]] for key, of in (("ends", "things"), ("mark", "poses")))
+    many = bars > 8
+    assert ends == [[f"{bar}a", f"{bar}b"] if many else None for bar in range(bars)]
+    assert marks == (list(sockets) if many else [None] * 2 * bars)
+    assert ("its bar; thin lines" in view.legend[0]) == many
+
+
 @pytest.mark.parametrize(
     ("verdict", "expected"),
     [
+        ("gear is recommended: it predicts.", ("gear is recommended", "It predicts.")),
+        ("As predicted: held-out poses.", ("As predicted", "Held-out poses.")),
         ("To be used with care: d_5; more. U is 1.", ("To be used with care", "d_5; more. U is 1.")),
         ("It gives U (k = 2; at worst 3 mm): so. And more.", ("It gives U (k = 2; at worst 3 mm)", "So. And more.")),
         ("Measured; no limit was given.", ("Measured", "No limit was given.")),

@@ -56,7 +56,7 @@ def summary(factors, medians, se=1e-4):
         (
             {BOUND: [1.0, 5.0]},
             [0.1, 0.105],
-            "Half-width of lengths: no level changes the length errors by more than 10 %.",
+            "No level of half-width of lengths changes the length errors by more than 10 %.",
         ),
         ({BOUND: [1.0]}, [0.1], "The length errors have a median of 0.1 mm; 95 % are below 0.2 mm."),
     ],
@@ -66,7 +66,7 @@ def test_a_study_says_how_far_its_factors_change_the_errors(factors, medians, sa
 
 
 def test_a_difference_within_monte_carlo_errors_is_none():
-    assert finding(summary({NOISE: [1.0, 2.0]}, [0.1, 0.15], se=0.05)).startswith("Encoder noise: no level changes")
+    assert finding(summary({NOISE: [1.0, 2.0]}, [0.1, 0.15], se=0.05)).startswith("No level of encoder noise changes")
 
 
 def test_no_finding_while_no_trial_has_converged():

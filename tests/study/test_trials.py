@@ -134,7 +134,7 @@ def test_deviations_have_their_distributions():
     assert np.abs(correlation - np.eye(15)).max() < 0.08
 
 
-@pytest.mark.first_rows(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "part",
     ["encoder_arcsec", "seating_mm", "resolution_arcsec", pytest.param("eccentricity_arcsec", marks=pytest.mark.slow)],

@@ -68,6 +68,7 @@ def test_so_many_further_poses_decide(paper_arm):
         assert again.decision == decision
 
 
+@pytest.mark.slow
 def test_the_risk_of_a_false_acceptance(paper_arm):
     """Of arms exactly at their limit, one in twenty passes, and one in twenty fails."""
     random, decisions, evaluated = np.random.default_rng(1), [], record({"rms_mm": 0.1}, paper_arm)

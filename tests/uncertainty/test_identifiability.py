@@ -75,7 +75,7 @@ def test_directions_move_nothing(paper_arm, single):
         assert np.abs(tips - tips.mean(axis=0)).max() < 1e-6  # of steps of 1e-3 mm and 1e-6 rad, to second order
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(("positions", "rank"), [(1, 19), pytest.param(2, 21, marks=pytest.mark.slow)])
 def test_lengths_alone(paper_arm, positions, rank):
     seen = aj.observability(paper_arm, pairs(paper_arm, ENDS[:positions]))

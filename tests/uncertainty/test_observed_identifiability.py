@@ -53,7 +53,7 @@ CASES = {
 }
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("case", "noise"),
     [
@@ -94,6 +94,7 @@ def test_a_target_takes_the_place_of_the_probe(paper_arm):
     }
 
 
+@pytest.mark.slow
 def test_transforms_that_an_arm_of_five_joints_cannot_take():
     """An arm that is not yet calibrated reaches none of them exactly, and still all that is free is determined."""
     arm, random = to_numpy(aj.load_arm("so100")), np.random.default_rng(0)

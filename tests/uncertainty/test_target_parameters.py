@@ -13,7 +13,7 @@ FRAME = (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0)
 LAST = {"alpha_6", "a_6", "d_6", "theta_6", "probe_x", "probe_y", "probe_z"}
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.first_rows(1)
 @pytest.mark.parametrize(
     ("observation", "wrist"),
     [
@@ -45,6 +45,7 @@ def test_a_tip_of_the_arms_own_is_no_target():
     assert not only_targets(aj.simulate(arm, {}, observations=[points], poses=1, seed=0))
 
 
+@pytest.mark.slow
 def test_expansion_is_free_where_temperatures_vary():
     arm = aj.Arm(alpha=[1.5, 0.1, 0.4], a=[50.0, 300.0, 40.0], d=[20.0, 0.0, 250.0], limits=[(-2, 2)] * 3)
     arm = with_corrections(arm, "expansion")

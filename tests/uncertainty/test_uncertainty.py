@@ -47,6 +47,7 @@ def result(paper_arm, capture, bounds) -> aj.Calibration:
     return aj.calibrate(paper_arm, capture, bounds, method="joint", noise=NOISE, shared_errors=False)
 
 
+@pytest.mark.slow
 def test_small_inverse_roots_are_those_of_cholesky():
     random = np.random.default_rng(0)
     for size in (1, 2, 3):

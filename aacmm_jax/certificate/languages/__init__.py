@@ -31,11 +31,13 @@ class _File(Strict):
     verdicts: dict[str, Text]
     rules: dict[str, Text]
     terms: dict[str, Text]
+    kinds: dict[str, Text]
     metrics: dict[str, Text]
 
 
 _GROUPS = tuple(name for name in _File.model_fields if name not in ("code", "decimal"))
-_SUFFIXED = {"sentences": "{}_sentence", "places": "place_{}", "metrics": "metric_{}"}  # whose keys others have as well
+# Of keys that other groups have as well.
+_SUFFIXED = {"sentences": "{}_sentence", "places": "place_{}", "kinds": "kind_{}", "metrics": "metric_{}"}
 
 
 class Language(NamedTuple):
@@ -49,6 +51,15 @@ class Language(NamedTuple):
         """The text of a key, with values for the names in its braces."""
         text = _NAMED.sub(lambda match: values.get(match[1], match[0]), self.texts[key])
         return text.replace(" %", "\u00a0%")
+
+    def known(self, key: str, otherwise: str) -> str:
+        """The text of a key, or another where this language has none."""
+        return self(key) if key in self.texts else otherwise
+
+    def counted(self, key: str, number: str) -> str:
+        """The text of a key with a number; "one | several" where they differ."""
+        forms = self(key, number=number).split(" | ")
+        return forms[0 if number == "1" else -1]
 
     def stated(self, text: str) -> str:
         """A text, or that it is not stated, in this language."""

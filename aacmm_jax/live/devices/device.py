@@ -26,6 +26,7 @@ class AbstractDevice(abc.ABC):
         message: What is wrong at present; empty where nothing is.
         lines: How many lines, messages or images were read.
         bad: How many of these could not be used, by reason.
+        read_as: Which of its readings is that of each joint, and in which direction (`Recording.read_as`).
 
     Example:
         >>> class Resting(aj.live.AbstractDevice):
@@ -42,6 +43,7 @@ class AbstractDevice(abc.ABC):
     connected: bool = False
     message: str = ""
     lines: int = 0
+    read_as: tuple[int, ...] | None = None
     bad: Counter[str]
 
     def __init__(self, name: str):

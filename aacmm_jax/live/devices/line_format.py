@@ -176,6 +176,11 @@ class LineFormat:
             values.append(float(cell))
         return self._made(values, time)
 
+    @property
+    def read_as(self) -> tuple[int, ...] | None:
+        """`Recording.read_as` of its lines."""
+        return self._table.angles.read_as(self._arm.joints)
+
     def _header(self, cells: list[str]) -> str:
         """Take the names of a table's header, where these are columns that are known."""
         names = [_UNIT.sub("", cell.strip("\"'")) for cell in cells]

@@ -37,6 +37,11 @@ class AbstractLines(AbstractDevice):
         """Of the line format; a header may still say."""
         return self._format.joints
 
+    @property
+    def read_as(self) -> tuple[int, ...] | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Likewise."""
+        return self._format.read_as
+
     @abc.abstractmethod
     def _connect(self) -> None:
         """Connect, or raise `OSError`."""

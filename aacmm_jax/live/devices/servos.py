@@ -54,6 +54,7 @@ class Servos(AbstractDevice):
         super().__init__(f"servos:{where}")
         self._bus, self._arm, self._port, self._retry_at = bus, setup.specification.arm, None, 0.0
         self.joints = len(bus.ids)
+        self.read_as = bus.angles.read_as(self.joints)
         usual = _ADDRESSES[bus.protocol]
         self._address, self._bytes = bus.address or usual[0], bus.bytes or usual[1]
         self._silent = 0

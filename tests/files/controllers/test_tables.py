@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.files.controllers.offsets import remaining_error
+from aacmm_jax.kinematics.arm import joint_limits
 from aacmm_jax.kinematics.axes_to_dh import rotation
 
 from ...refusals import assert_refused
@@ -99,6 +101,35 @@ def test_zero_offsets_leave_the_error_that_they_cannot_take(arm):
     rows = [line.split(",") for line in text.splitlines() if line[0].isdigit()]
     np.testing.assert_allclose([float(row[2]) for row in rows], found.offsets)
     np.testing.assert_allclose([float(row[1]) for row in rows], np.degrees(found.offsets))
+
+
+def test_zero_offsets_of_a_few_poses_are_judged_over_all_joint_limits(arm):
+    """Poses in one corner give offsets that are worse elsewhere, which is said; fitted over all, none are, and joints
+    whose zeros the calibration does not determine get none."""
+    calibrated = arm.replace(
+        a_4=float(arm.a[3]) + 2, alpha_2=float(arm.alpha[1]) + 0.01, theta_2=float(arm.theta[1]) + 0.005
+    )
+    corner = 0.05 * Q
+    narrow = aj.files.zero_offsets(arm, calibrated, corner)
+    found = aj.files.zero_offsets(arm, calibrated, corner, free=("theta_2", "theta_3"), within_limits=True)
+    anywhere = np.random.default_rng(7).uniform(*np.asarray(joint_limits(arm, None)).T, (1000, 7))
+
+    def rms(offsets: np.ndarray) -> float:
+        apart = np.asarray(arm.position(anywhere + offsets)) - np.asarray(calibrated.position(anywhere))
+        return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
+
+    assert rms(found.offsets) < rms(np.zeros(7)) < rms(narrow.offsets)
+    assert found.within_limits is not None
+    np.testing.assert_allclose(found.within_limits[:2], [rms(np.zeros(7)), rms(found.offsets)], rtol=0.05)
+    assert found.held == (1, 4, 5, 6, 7)
+    assert not np.any(found.offsets[[0, 3, 4, 5, 6]])
+    worse = found._replace(within_limits=(1.0, 2.0, 3.0))
+    notes = " ".join(remaining_error(worse))
+    assert "over all joint limits, the arm is not better with these offsets" in notes
+    assert "so they get no offset: 1, 4, 5, 6, 7" in notes
+    assert "not better" not in " ".join(remaining_error(found))
+    text = aj.files.zero_offsets_csv(found._replace(read_as=(1, -2, 3, 4, 5, 6, 7)))
+    assert "# Recorded with the opposite sign, so subtract there instead: joint 2." in text
 
 
 def test_tables_list_the_coefficients_of_corrections_with_their_units(paper_arm):

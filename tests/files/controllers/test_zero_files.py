@@ -49,6 +49,11 @@ def test_lerobot_readings_change_by_the_offsets(tmp_path):
         assert {**motors[name], "homing_offset": 0} == {**MOTORS[name], "homing_offset": 0}
     assert motors["gripper"] == MOTORS["gripper"]
     assert "whole counts of 0.088 deg" in changed.notes[0]
+    # Signs and order as recorded, unless the motors are named.
+    signed = json.loads(aj.files.lerobot_calibration(path, zeros()._replace(read_as=(-1, 2, 3, 5, -4, 6))).text)
+    named = ["-pan", "lift", "elbow", "roll", "-flex", "turn"]
+    assert signed == json.loads(aj.files.lerobot_calibration(path, zeros(), named).text)
+    assert signed["pan"]["homing_offset"] == -300 + 7  # 0.01 rad are 6.5 counts
     # Exact, where an offset is a whole number of counts; the other way round by a minus; in another order.
     exact = zeros()._replace(offsets=OFFSETS[:2] * 0 + 2 * np.pi / 4096 * np.array([5, 7]), units=("rad",) * 2)
     motors = json.loads(aj.files.lerobot_calibration(path, exact, ["lift", "-pan"]).text)
@@ -125,11 +130,16 @@ def test_export_by_the_command_line(tmp_path):
     files = {"lerobot": ["--file", "motors.json"], "kuka": ["--file", "machine.dat"], "ros-calibration": []}
     for name, more in files.items():
         said = command_line(tmp_path, *export, name, *more, "-o", f"{name}.out").stdout
-        assert "With these zero offsets, the tips of the nominal and the calibrated arm differ by" in said
+        assert (
+            "With these zero offsets, the tips of the nominal and the calibrated arm differ in the recorded poses by"
+            in said
+        )
+        assert "over all joint limits by" in said
     assert (tmp_path / "kuka.out").read_bytes().count(b"\r\n") == DATA.count("\r\n")
     offsets = command_line(tmp_path, *export, "offsets").stdout
-    first = float(next(line for line in offsets.splitlines() if line.startswith("1,")).split(",")[1])
+    second = float(next(line for line in offsets.splitlines() if line.startswith("2,")).split(",")[1])
     kuka = (tmp_path / "kuka.out").read_text().splitlines()
-    assert float(next(line for line in kuka if "[1]" in line).split("=")[1]) == pytest.approx(-20 + first, abs=1e-6)
+    assert second
+    assert float(next(line for line in kuka if "[2]" in line).split("=")[1]) == pytest.approx(-120 + second, abs=1e-6)
     assert "--file is needed" in command_line(tmp_path, *export, "kuka", expect=2).stderr
     assert "--file is needed" in command_line(tmp_path, *export, "csv", "--motors", "a", expect=2).stderr

@@ -59,7 +59,7 @@ def read(tmp_path, unit, more=""):
     return aj.files.read_manifest(tmp_path / "capture.toml")
 
 
-@pytest.mark.first_rows(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", READ)
 def test_every_number_that_lerobot_reads_is_the_same_angle(tmp_path, unit):
     data_set(tmp_path / "set", READ[unit])

@@ -169,7 +169,7 @@ def calibration_data(folder, kind, sensors):
     return bag.path, points
 
 
-@pytest.mark.first_rows(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_robot_calibration_has_poses_and_points(tmp_path, kind):
     path, points = calibration_data(tmp_path, kind, {"camera": 12, "led": 1})
