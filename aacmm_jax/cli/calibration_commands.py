@@ -111,7 +111,8 @@ def calibrate(
     ),
     cross_validate: bool | None = option(
         "Hold out each placement, station or other group of observations in turn, calibrate with the others, and test "
-        "the result on the group held out. If there is only one group, regions of joint space are held out instead. "
+        "the result on the group held out. Of one group (one tracker and one target), its observations are held out in "
+        "turn if the manifest divides it into at least three ('group'), or else regions of joint space. "
         "Default: yes for a recorded capture with several placements of the reference length, unless --model, --prior "
         "or --robust is given."
     ),
