@@ -22,6 +22,7 @@ def test_there_are_forty_mistakes_and_eight_cases():
     assert {kind.unit for kind in KINDS.values()} == {"angle", "length", "share", "times", ""}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["arm6-sockets", "irb-bar"])
 def test_every_mistake_changes_its_capture_and_names_its_culprit(case, tmp_path):
     """The patterns of right findings need the names that the mistake was made with."""
@@ -41,6 +42,7 @@ def written(name, case, folder):
     return trial, {path.name: path.read_text() for path in folder.iterdir()}
 
 
+@pytest.mark.slow
 def test_only_the_mistake_is_in_the_residuals_of_an_exact_capture():
     """Without a mistake there are none; with one, their squares grow as its size does, so that it has a limit."""
     assert shown(None, "arm6-sockets", 0.0)[0] < 1e-9
@@ -53,6 +55,7 @@ def test_only_the_mistake_is_in_the_residuals_of_an_exact_capture():
     assert np.isnan(detection_limit("wrong sign", "arm6-sockets"))
 
 
+@pytest.mark.slow
 def test_poses_are_named_as_findings_name_them():
     row = run("reading mistyped", "arm6-sockets", 2e-3)
     assert row["culprit"]["pose"] == "B pose 5"

@@ -18,7 +18,7 @@ def test_default_parameters_are_the_papers(paper_arm):
     assert aj.Parameters.free_of(paper_arm).names == published.ORDER
 
 
-@pytest.mark.first_rows(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "hold"),
     [(1, None), pytest.param(2, "d_3", marks=pytest.mark.slow)]

@@ -1,11 +1,56 @@
-"""Commanded poses of ``correct``: their temperature, and the frame that they are in."""
+"""Commanded poses of ``correct``: the tip that they are of, their temperature, and the frame that they are in."""
 
 from typing import Any
 
 import numpy as np
 
 from ..core.errors import InputError
+from ..core.text import printable
 from .arm_command import first_frame
+from .options import numbers_option
+
+
+def targets_of(record: Any, chain: Any) -> dict[str, np.ndarray]:
+    """Positions in the last frame that the calibration has found, mm, by the name of the target; of a robot, those on
+    the chain."""
+    from ..data.observations.observation import offset_of
+
+    found, geometry = {}, record.observed.geometry
+    for observation in record.recording.capture.observations:
+        part, q = offset_of(observation.target or ""), np.asarray(observation.q)
+        if part in geometry and (chain is None or (q[:, chain.robot_joints] == chain.number).any()):
+            found[observation.target] = np.asarray(geometry[part])[:3]
+    return found
+
+
+def tool_tip(record: Any, chain: Any, probe: str) -> np.ndarray:
+    """The tip that ``--probe`` gives in the last frame, mm: X,Y,Z, or the name of a target of the calibration."""
+    targets = targets_of(record, chain)
+    if probe in targets:
+        return targets[probe]
+    names = ", ".join(map(printable, targets)) or "none"
+    return np.array(numbers_option("--probe", probe, f"X,Y,Z in mm, or a target of the calibration ({names})", 3))
+
+
+def other_tip(record: Any, chain: Any, meant: np.ndarray) -> list[str]:
+    """That positions are those of another point than the targets whose positions were calibrated, where they are."""
+    targets = targets_of(record, chain).items()
+    targets = {name: at for name, at in targets if not np.allclose(at, meant, rtol=0, atol=1e-3)}
+    if not targets:
+        return []
+    of, first = (
+        ", ".join(f"{printable(name)} ({_mm(at)})" for name, at in targets.items()),
+        printable(next(iter(targets))),
+    )
+    return [
+        f"The positions are those of the arm's tip, ({_mm(meant)}) mm in the last frame, not those of the measured "
+        f"target, which the calibration found elsewhere in this frame [mm]: {of}. If the target is to reach the "
+        f"positions, give --probe {first}; for a tool, give --probe X,Y,Z."
+    ]
+
+
+def _mm(point: np.ndarray) -> str:
+    return ", ".join(f"{x:.3f}" for x in point)
 
 
 def at_temperature(commanded: Any, calibrated: Any, temperature: float | None) -> np.ndarray:

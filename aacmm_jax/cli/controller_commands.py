@@ -18,7 +18,7 @@ from .app import command, show_summary, warn_of_unusable
 from .arm_command import first_frame
 from .certificate_command import dcc_of
 from .chains import named_chain, one_chain_of
-from .commanded import at_temperature, in_first_frame
+from .commanded import at_temperature, in_first_frame, other_tip, tool_tip
 from .options import argument, flag, names_option, numbers_option, option, output
 
 _ROBOTS = ("urdf", "mjcf")
@@ -298,6 +298,7 @@ def _urdf(record: Any, specification: Any, form: str) -> tuple[str, list[str]]:
     "aacmm correct robot.h5 left.csv -o corrected.csv --unit deg --chain left",
     "aacmm correct calibration.h5 points.csv -o commanded.csv --unit deg --near 0,-90,90,0,90,0 --write poses",
     "aacmm correct calibration.h5 poses.csv -o corrected.csv --unit deg --near 0,-90,90,0,90,0 --probe 0,0,150",
+    "aacmm correct robot.h5 points.csv -o corrected.csv --unit deg --near 0,-90,90,0,90,0 --probe reflector",
 )
 def correct(
     calibration: Path = options.CALIBRATION_FILE,
@@ -327,9 +328,10 @@ def correct(
         "Q1,Q2,...",
     ),
     probe: str | None = option(
-        "Position (mm) of the tool tip in the last frame, the same for the nominal and the calibrated arm. Default: "
-        "the probe of each arm; the difference between the two probes is then corrected too.",
-        "X,Y,Z",
+        "Tip of the tool in the last frame (mm), the same for the nominal and the calibrated arm; or the name of a "
+        "target whose position the calibration found. Default: the tip of each arm, not a target; if the calibration "
+        "changed the tip, this change is corrected too.",
+        "X,Y,Z or TARGET",
     ),
     temperature: float | None = option(
         "Temperature (C) of the arm, if the arm was calibrated with thermal expansion. Default: the column "
@@ -376,7 +378,7 @@ def correct(
         nominal, calibrated = to_numpy((record.recording.nominal.arm, record.calibrated.arm))
         own = named_chain(nominal, chain)
         if probe is not None:
-            tool = numbers_option("--probe", probe, "X,Y,Z in mm", 3)
+            tool = tool_tip(record, own, probe)
             nominal, calibrated = nominal.replace(probe=tool), calibrated.replace(probe=tool)
         commanded = read_poses(
             InputFile(poses),
@@ -407,6 +409,8 @@ def correct(
         )
         tip = slice(None) if own is None else slice(3 * own.number, 3 * own.number + 3)
         summary["probe_mm"] = [np.asarray(arm.probe)[tip].tolist() for arm in (nominal, calibrated)]
+        if probe is None and (commanded.poses is not None or summary["position_only"]):
+            summary["warnings"] += other_tip(record, own, np.asarray(nominal.probe)[tip])
         if commanded.temperature is not None and q.shape[1] == calibrated.beside.own:
             summary["warnings"].append(
                 "The arm was calibrated without thermal expansion, so the column temperature_C has no effect; "

@@ -1,12 +1,13 @@
 """Commands for who wants to know whether the maker's calibration is good: ``verify``, and ``sockets`` to print."""
 
+import os
 from pathlib import Path
 from typing import Any
 
 import typer
 
 from .. import files, plot, summaries
-from ..files.inputs import InputFile
+from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together, write_atomically
 from ..summaries.tables import View
 from . import options
@@ -16,6 +17,7 @@ from .options import argument, option, output
 
 @command(
     "aacmm verify poses.toml --delivered kinematics.yaml",
+    "aacmm verify poses.toml --delivered panda -o verified.html",
     "aacmm verify capture.h5 --delivered robot-as-delivered.urdf --tip tool0",
 )
 def verify(
@@ -32,30 +34,45 @@ def verify(
     ),
     base: str | None = options.BASE_LINK,
     tip: list[str] | None = options.TIP_LINK,
+    output: Path | None = output(
+        "Page for printing: verdict, picture, numbers, and what was not tested.", "PAGE.html", default=None
+    ),
     as_json: bool = options.JSON,
 ) -> None:
     """Test the maker's parameters on a few poses.
 
     The command prints the error of the tip as delivered, with U; whether the delivered parameters are better or worse
     than the nominal ones, or as good, or that these poses do not decide it; how many poses do; and what a recalibration
-    would gain.
+    would gain. If the delivered parameters are the nominal ones, it prints whether they are good or a calibration would
+    gain 30 % and more.
     The position of the tool tip, the frames of instruments and the positions of sockets are unknown and are fitted.
 
     The verdict is a two-sided test at the 5 % level, and "no difference that matters" (errors over the working volume
     that differ by less than 30 % of the larger) two one-sided tests. The exit code is 1 if the delivered parameters
-    are worse.
+    are worse, or not good.
     """
     from ..pipeline.verification import verify as run
 
-    recording = read_with_progress(capture) if capture.suffix == ".toml" else files.load_capture(InputFile(capture))
-    arm = None if delivered is None else files.load_specification(delivered, base=base, tip=tip)
+    with together(output):
+        recording = read_with_progress(capture) if capture.suffix == ".toml" else files.load_capture(InputFile(capture))
+        arm = None if delivered is None else files.load_specification(delivered, base=base, tip=tip)
     checked = with_spinner("Verifying", lambda: run(recording, arm))
-    given = arm or recording.as_found
+    given, measured = arm or recording.as_found, recording.capture
     summary = summaries.verification.verification_summary(
-        checked, recording.nominal.name, delivered or ("" if given is None else given.name)
+        checked,
+        recording.nominal.name,
+        delivered or ("" if given is None else given.name),
+        scaled=bool(measured.lengths or measured.observations),
     )
+    if output is not None:
+        from ..report import write_verification
+
+        files_read = [path for path in (capture, delivered) if path and os.path.isfile(path)]
+        sources = dict.fromkeys([*map(fingerprint, files_read), *recording.sources])
+        write_verification(output, checked, measured, summary, sources=list(sources))
+        summary["written"] = str(output)
     show_summary(summary, as_json, summaries.verification.verification)
-    if checked.verdict == "worse":
+    if checked.verdict in ("worse", "not good"):
         raise typer.Exit(1)
 
 

@@ -33,8 +33,9 @@ def test(case: Case) -> list[Finding]:
         Finding(
             "errors-of-places",
             f"U is {stated / without:.1f} times as large because of errors that all poses of a socket may share, as "
-            f"far as {lengths} reference lengths show them: U of lengths between poses is {stated:.2g} mm with such "
-            f"errors, as stated, and {without:.2g} mm without them.",
+            f"far as {lengths} reference lengths show them: U of a length from one pose to another far from "
+            f"it (not of 300 mm; without the noise of both readings) is {stated:.2g} mm with such errors, and "
+            f"{without:.2g} mm without them.",
             advice="Measure the reference length in further placements.",
         )
     ]

@@ -91,7 +91,7 @@ def shifted_seats(capture: Capture, near: MissingTerm | None = None) -> list[Mis
             follows = f"a displacement of {place} from {names[poses[first]]} on"
             term = MissingTerm("shifted seat", None, later[:, None, None] * np.eye(3), follows=follows)
             term = term._replace(first=int(poses[first]))
-            cause = "a seat or artefact that shifts"
+            cause = f"a {'seat' if capture.sizes else 'target, station'} or artefact that shifts"
             terms.append(term._replace(cause=cause, concerns=owners[poses[0]]))
     return terms
 

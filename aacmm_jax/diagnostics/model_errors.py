@@ -63,13 +63,14 @@ def test(case: Case) -> list[Finding]:
     if misfit is not None and misfit.probability < LEVEL:
         findings.append(_misfit(misfit))
     if successive is not None and successive.probability < LEVEL:
+        what = "seat" if case.record.recording.capture.sizes else "target, instrument or artefact"
         shared = set() if case.record.shared is None else set(case.record.shared.kinds)
         findings.append(
             Finding(
                 "successive-poses",
                 f"Residuals of successive poses are autocorrelated (correlation {successive.correlation:.2f}, "
-                f"{chance_text(successive.probability)}): either the seat shifts at each visit, or there are errors "
-                "that the model does not describe.",
+                f"{chance_text(successive.probability)}): either the {what} shifts at each visit, or there "
+                "are errors that the model does not describe.",
                 "The stated uncertainties include the shared errors of successive poses, as estimated from the "
                 "residuals."
                 if shared & {VISITS, SUCCESSIVE}

@@ -71,10 +71,16 @@ def can_cross_validate(capture: Capture, parameters: int) -> bool:
 
 
 def _parts_of(capture: Capture) -> list[_Part]:
-    """Group by group or, of one group of observations only, by regions of joint space."""
+    """Group by group or, of one group of observations only, by these where they divide one recording, or by regions of
+    joint space."""
     groups = groups_of(capture)
     if len(groups) > 1 or not capture.observations:
         return _parts(capture, groups)
+    # As the column of `group` in a manifest divides it, such as by parts of the workspace: all share all geometry.
+    parts = {tuple(observation.unknowns) for observation in capture.observations}
+    enough = not capture.sizes and all(len(o.q) >= _POSES_A_REGION for o in capture.observations)
+    if len(parts) == 1 and enough and len(capture.observations) >= _GROUPS:
+        return _parts(capture, [(observation.name,) for observation in capture.observations])
     if capture.sizes or any(len(o.q) < 2**_HALVINGS * _POSES_A_REGION for o in capture.observations):
         return []
     regions = [_regions(np.asarray(observation.q)) for observation in capture.observations]
@@ -83,8 +89,8 @@ def _parts_of(capture: Capture) -> list[_Part]:
         pairs = zip(capture.observations, regions, strict=True)
         return Capture({}, [], [o.select(np.flatnonzero((region == number) == inside)) for o, region in pairs])
 
-    names = [tuple(f"{o.name}, region {i + 1}" for o in capture.observations) for i in range(2**_HALVINGS)]
-    return [(only(i, False), only(i, True), of_region) for i, of_region in enumerate(names)]
+    of = f"{capture.observations[0].name}, " if len(capture.observations) == 1 else ""
+    return [(only(i, False), only(i, True), (f"{of}region {i + 1}",)) for i in range(2**_HALVINGS)]
 
 
 def _regions(q: Float[np.ndarray, "m n"]) -> np.ndarray:
@@ -119,8 +125,10 @@ def cross_validate(
     """Calibrate once without each group of sockets and observations, and evaluate the result on that group.
 
     A group is what reference lengths or a shared unknown geometry join: a placement, all that one station measured, a
-    sphere. Where all is one group without sockets, such as the points of one station, regions of joint space are left
-    out instead. The geometry of what was left out is fitted to the arm.
+    sphere. Where all is one group without sockets, such as the points of one station, its observations are left out
+    one at a time, if there are at least three of at least ten poses each and all share the same geometry (parts of the
+    workspace, by ``group`` in a manifest), or regions of joint space if not. The geometry of what was left out is
+    fitted to the arm.
 
     Where errors exceed what the uncertainty predicts, the model misses an effect (elastic joints, eccentric encoders)
     that poses similar to those identified from do not show.

@@ -83,7 +83,11 @@ def points_sentence(rows: Sequence[dict[str, Any]]) -> str:
         )
     fitting = [row for row in rows if row["fits"]]
     if len(fitting) > 1:
-        says += f" {len(fitting)} ways fit equally well."
+        says += (
+            f" {len(fitting)} ways fit equally well, but only one is right: with the wrong sign of the deviations, "
+            "corrections double the errors. If their sign is not stated, correct one pose, command and measure it: its "
+            "deviation must become smaller."
+        )
     if fitting and not fitting[0]["taken"]:
         says += f" Write in the table of the points: {' or '.join(row['lines'][0] for row in fitting if row['lines'])}."
     return says

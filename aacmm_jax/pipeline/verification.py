@@ -16,6 +16,11 @@ not show speaks against the verdict.
 Where neither is decided, the two may be equivalent: the ratio of their RMS errors over the working volume lies between
 `MARGIN` and 1 / `MARGIN`. That is decided by two one-sided tests at 5 % (Schuirmann 1987, Journal of Pharmacokinetics
 and Biopharmaceutics 15, 657-680), with the posteriors about both arms: of whichever speaks against it more.
+
+Delivered parameters that are the nominal ones have nothing to be compared with but a calibration. They are "not good"
+where, at 5 %, a calibration with these poses would leave less than `MARGIN` of their error over the working volume in
+the posterior about them. They are "good" where it is expected to leave more, and that error is no larger than the RMS
+error that these poses show may be: else the poses say too little of the working volume.
 """
 
 import math
@@ -49,7 +54,7 @@ from ..kinematics.parameters import ArmSpecification, Bounds, Parameters
 from ..uncertainty.linearisation import Linearisation
 
 VerdictHere = Literal["better", "worse", "not decided"]
-Verdict = Literal["better", "worse", "equivalent", "not decided"]
+Verdict = Literal["better", "worse", "equivalent", "good", "not good", "not decided"]
 LEVEL = 0.05  # of the two-sided test, and of each of the two one-sided tests of equivalence
 MARGIN = 0.7  # of the smaller to the larger RMS error over the working volume: equivalent from here on
 _LENGTHS = 1000.0  # mm; half-width of the box of lengths and of the tip
@@ -95,7 +100,7 @@ class Verification(NamedTuple):
         better 60 182 15
     """
 
-    verdict: Verdict  # of the delivered parameters against the nominal ones
+    verdict: Verdict  # of the delivered parameters against the nominal ones; of the same ones, against a calibration
     nominal: Accuracy
     delivered: Accuracy
     share: float  # of the correction from nominal to delivered that is real: 1 all, 0 nothing, 0.5 no better than none
@@ -106,11 +111,12 @@ class Verification(NamedTuple):
     equations: int
     unknowns: int  # tip, frames and positions of sockets
     decided_by: int | None  # poses that decide between the two, at these errors; None: more than a thousand
-    length_errors: Float[np.ndarray, "2 l"]  # of the reference lengths by both arms, mm
+    length_errors: Float[np.ndarray, "2 l"]  # of the reference lengths by both arms, between centroids of sockets, mm
+    distances: Float[np.ndarray, "2 m"]  # of the poses from their geometry by both arms, mm; sockets first
     volume: (
-        float  # RMS error of the delivered arm over the working volume, as a calibration with these poses has it, mm
+        float  # RMS error of the delivered arm over the working volume, as a calibration with these poses sees it, mm
     )
-    recalibrated: float  # and that of an arm calibrated with these poses, mm
+    recalibrated: float  # and at least that of an arm calibrated with these poses: its parameters' part, mm
     ratio_lower: float  # of the delivered to the nominal arm's RMS error over the working volume, 90 % interval
     ratio_upper: float
     verdict_here: VerdictHere  # for poses such as these
@@ -118,7 +124,7 @@ class Verification(NamedTuple):
 
     @property
     def gain(self) -> float:
-        """What a recalibration with these poses gains over the working volume, mm."""
+        """What a recalibration with these poses gains at most over the working volume, mm."""
         return self.volume - self.recalibrated
 
 
@@ -131,6 +137,9 @@ def verify(recording: Recording, delivered: ArmSpecification | Arm | None = None
     arms that are equally good, one in forty is called better and one in forty worse. It is "equivalent" where neither
     is decided, and two one-sided tests at 5 % show that the smaller RMS error over the working volume is at least 70 %
     of the larger; else "not decided". What the poses do not show of the working volume counts against any verdict.
+    Parameters that are the nominal ones are "not good" if, by a one-sided test at 5 %, a calibration with these poses
+    would leave less than 70 % of their error over the working volume. They are "good" if it is expected to leave more,
+    and the expected error there is no larger than the upper limit of the RMS error in these poses.
 
     Args:
         recording: poses in sockets, on a board, or seen by a tracker; its nominal arm is the one to compare with.
@@ -188,6 +197,12 @@ def verify(recording: Recording, delivered: ArmSpecification | Arm | None = None
         verdict = paired.verdict
     elif not paired.same and lower >= MARGIN and upper <= 1 / MARGIN:
         verdict = "equivalent"
+    elif paired.same:
+        error, left = from_delivered.error, from_delivered.left
+        if left < MARGIN * float(np.quantile(from_delivered.errors, LEVEL)):
+            verdict = "not good"
+        elif left >= MARGIN * error and error <= accuracies[1].upper:
+            verdict = "good"
     return Verification(
         verdict=verdict,
         nominal=accuracies[0],
@@ -200,7 +215,8 @@ def verify(recording: Recording, delivered: ArmSpecification | Arm | None = None
         equations=equations,
         unknowns=unknowns,
         decided_by=paired.poses_to_decide(rows[1].poses),
-        length_errors=np.array([part.relations()[1][: len(recording.capture.lengths)] for part in linear]),
+        length_errors=np.array([_length_errors(*pair, recording.capture) for pair in zip(arms, linear, strict=True)]),
+        distances=np.array([_distances(part) for part in linear]),
         volume=from_delivered.error,
         recalibrated=from_delivered.left,
         ratio_lower=lower,
@@ -273,8 +289,25 @@ def _without(basis: Float[np.ndarray, "R r"], values: Float[np.ndarray, "R ..."]
     return values - basis @ (basis.T @ values)
 
 
+def _distances(fit: Linearisation) -> Float[np.ndarray, " m"]:
+    """Of all poses from their geometry, mm."""
+    squares = fit.observed.by_observation(fit.observed.squared_distances(fit.point.rows))
+    return np.sqrt(np.concatenate([np.asarray(part) for part in squares]))
+
+
+def _length_errors(arm: Arm, fit: Linearisation, capture: Any) -> Float[np.ndarray, " l"]:
+    """Between the centroids of sockets, mm: their positions are fitted to the lengths and show next to no error."""
+    errors = fit.relations()[1][: len(capture.lengths)].copy()
+    tips = np.asarray(_with_tip(arm, fit)[0].position(capture.q))
+    centroids = {name: tips[capture.owner == i].mean(axis=0) for i, name in enumerate(capture.names)}
+    for i, length in enumerate(capture.lengths):
+        if {length.start, length.end} <= centroids.keys():
+            errors[i] = np.linalg.norm(centroids[length.end] - centroids[length.start]) - length.value
+    return errors
+
+
 def _accuracy(fit: Linearisation, rows: _Rows) -> Accuracy:
-    squares = np.concatenate([np.asarray(part) for part in fit.observed.squared_distances(fit.point.rows)])
+    squares = _distances(fit) ** 2
     equations, freedom = len(rows.residual), len(rows.residual) - rows.rank
     mean = max(float(squares.mean()), EXACT**2)
     # Squared distances of single poses scatter more, or less, than those of one normal distribution.
@@ -345,8 +378,13 @@ class _Volume(NamedTuple):
 
     probability: float  # that more than half of the step to the other arm is real there
     ratio: Float[np.ndarray, " d"]  # draws of the other arm's RMS error over this one's
-    error: float  # expected RMS error of the arm, mm
-    left: float  # and that of a calibration with these poses
+    errors: Float[np.ndarray, " d"]  # and of this one's, mm
+    left: float  # RMS error of a calibration with these poses, mm
+
+    @property
+    def error(self) -> float:
+        """Expected RMS error of the arm, mm."""
+        return math.sqrt(np.mean(self.errors**2))
 
     @classmethod
     def of(cls, arm: Arm, other: Arm, fit: Linearisation, of_other: Linearisation, sigma: float) -> "_Volume":
@@ -396,7 +434,7 @@ class _Volume(NamedTuple):
         errors = (mean + np.sqrt(spread) * random.normal(size=spread.shape)) @ by_parameters.T
         own, others = np.sum(errors**2, axis=1), np.sum((errors - step) ** 2, axis=1)
         probability, ratio = float(np.mean(others < own)), np.sqrt(others / np.maximum(own, 1e-300))
-        return cls(probability, ratio, math.sqrt(own.mean() / _TESTED), math.sqrt(remaining / _TESTED))
+        return cls(probability, ratio, np.sqrt(own / _TESTED), math.sqrt(remaining / _TESTED))
 
 
 def _with_tip(arm: Arm, fit: Linearisation) -> tuple[Arm, tuple[str, ...]]:

@@ -1,5 +1,5 @@
 """Reports for laboratories and their customers: one HTML file for a calibration, an evaluation, a study or
-compared models; and the page of a plan.
+compared models; and the pages of a plan and of a verification.
 
 Warnings and tables that the command line shows too are worded in `summaries`; figures for papers are in `plot`.
 """

@@ -96,6 +96,7 @@ class Report(NamedTuple):
     facts: list[tuple[str, str]]
     sections: list[Section]
     simulated: bool = False
+    one_page: bool = False  # printed smaller, to fit
     decision: str | None = None  # of its acceptance tests, all together
     administrative: Sequence[tuple[str, list[tuple[str, str]]]] = ()  # groups of titles and values
 

@@ -10,17 +10,20 @@ from typing import Any
 from ..acceptance.procedure import Procedure
 from ..acceptance.record import SIMULATED
 from ..core.errors import require
+from ..data.capture import Capture
 from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity
 from ..files.hdf5 import provenance, read_summary, read_tables
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together, write_text
 from ..files.plans import Angles
+from ..pipeline.verification import Verification
 from ..planning.design import Plan
 from ..planning.kit import KitPlan
 from ..plot.charts import Chart
 from ..plot.svg import drawn, key, points, shade_keys
 from ..summaries import planning
 from ..summaries.tables import Cell, Table
+from ..summaries.verification import verification_summary
 from .elements import ArmView, Report
 
 KINDS = ("calibration", "evaluation", "study", "model comparison", "comparison")
@@ -139,6 +142,42 @@ def write_plan(
         report = plan_report(planned, shown, view(shown), plan_csv(planned, angles, both_sides))
         attributes = provenance("plan") | {"sources": list(sources) or ["none"]}
         return _written(report, _origin(None, attributes), Path(target))
+
+
+def write_verification(
+    target: str | os.PathLike,
+    checked: Verification,
+    capture: Capture,
+    summary: dict[str, Any] | None = None,
+    *,
+    sources: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Write what `aacmm_jax.verify` found as one HTML file that prints on one page: the verdict, the distance of every
+    pose, the errors, what a calibration would gain, and what was not tested.
+
+    Returns title, verdict, warnings and size of the page. `InputError` if the target cannot be written, or Jinja is not
+    installed.
+
+    Args:
+        target: The HTML file to write, whole or not at all.
+        checked: What was found.
+        capture: The poses.
+        summary: What ``aacmm verify --json`` prints; by default without the names of the arm and the parameters.
+        sources: Names and digests of the files.
+
+    Example:
+        >>> checked = aj.verify(aj.Recording(two_bars, nominal), nominal._replace(arm=true))
+        >>> written = aj.report.write_verification("verified.html", checked, two_bars)
+        >>> print(written["title"])
+        Verification of delivered parameters, an arm
+    """
+    require("report", "a page")
+    from .verification import verification_report
+
+    shown = verification_summary(checked, "an arm", "stated parameters") if summary is None else summary
+    with together(target):
+        attributes = provenance("verification") | {"sources": list(sources) or ["none"]}
+        return _written(verification_report(checked, capture, shown), _origin(None, attributes), Path(target))
 
 
 def _identity(attributes: dict[str, Any], given: AdministrativeData | None) -> str:

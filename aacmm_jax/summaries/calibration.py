@@ -203,7 +203,9 @@ def calibration_summary(record: CalibrationRecord, volume: VolumetricUncertainty
             bound=[sides.get(int(side)) for side in record.active],
         ),
         "uncertainty": _uncertainty_summary(record, volume),
-        "cross_validation": None if record.validation is None else cross_validation_summary(record.validation),
+        "cross_validation": None
+        if record.validation is None
+        else cross_validation_summary(record.validation, bool(record.recording.capture.sizes)),
         "model_tests": rows_of_tests(model_tests(record)) if fits else None,
         "prior": None if record.prior is None else prior_rows(record.prior),
         "shared_errors": None if record.shared is None else shared_rows(record.shared),
@@ -293,7 +295,7 @@ def shared_rows(shared: SharedErrors) -> list[dict[str, Any]]:
     return rows_of(kind=shared.kinds, sd=shared.sd, unit=shared.units)
 
 
-def cross_validation_summary(validation: CrossValidation) -> dict[str, Any]:
+def cross_validation_summary(validation: CrossValidation, of_sockets: bool = True) -> dict[str, Any]:
     """All groups together, and every group, the most improbable first; mm."""
     chances = [min(filter(math.isfinite, chances), default=math.nan) for chances in validation.probabilities]
     rows = []
@@ -307,6 +309,7 @@ def cross_validation_summary(validation: CrossValidation) -> dict[str, Any]:
     by_chance = sorted(rows, key=lambda row: 2.0 if row["probability"] is None else row["probability"])
     return {
         "groups": len(rows),
+        "of_sockets": of_sockets,
         **attributes(validation, "excess", "surprising", **names, length_u_mm="length_u"),
         "left_out": by_chance,
     }

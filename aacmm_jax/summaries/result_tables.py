@@ -69,12 +69,15 @@ def truth_table(truth: Row, stages: Mapping[str, str] = STAGES) -> Table:
 
 def validation_tables(summary: Row) -> list[Table]:
     """Cross-validation, pooled and group by group, the most improbable group first."""
+    sockets = "socket's centroid or " if summary["of_sockets"] else ""
     pooled = [
-        ("RMS distance of poses from their socket's centroid or geometry", "rms_mm", "rms_predicted_mm"),
+        (f"RMS distance of poses from their {sockets}geometry", "rms_mm", "rms_predicted_mm"),
         ("RMS error of reference lengths", "length_error_rms_mm", "length_u_mm"),
     ]
     cells = [(title, summary[value], summary[u]) for title, value, u in pooled if summary[value] is not None]
     caption = f"Cross-validation: each of {summary['groups']} groups held out once [mm]"
+    if summary["groups"] == 1:
+        caption = "The group held out, with its geometry (frame, target, ...) fitted to it again [mm]"
     shown = [listed(caption, cells, ("", "residual", "predicted by u"))]
     rows = summary.get("left_out") or []
     if rows:

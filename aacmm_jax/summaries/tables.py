@@ -301,8 +301,8 @@ def held_out_sentence(row: Mapping[str, Any]) -> str:
         return f"Held out: {pluralise(row['poses'], 'pose')}."
     predicted = "" if row["rms_predicted_mm"] is None else f", predicted {row['rms_predicted_mm']:.3g} mm"
     return (
-        f"Held out: {pluralise(row['poses'], 'pose')}; RMS distance from their geometry {row['rms_mm']:.3g} mm"
-        f"{predicted}, largest {row['largest_mm']:.3g} mm."
+        f"Held out: {pluralise(row['poses'], 'pose')}; RMS distance from their geometry, as the other poses "
+        f"determine it, {row['rms_mm']:.3g} mm{predicted}, largest {row['largest_mm']:.3g} mm."
     )
 
 

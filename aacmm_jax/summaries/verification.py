@@ -5,9 +5,9 @@ from typing import Any
 from ..core.text import pluralise
 from ..pipeline.verification import LEVEL, MARGIN, Accuracy, Verification
 from ..uncertainty.coverage import LEVEL_IN_PERCENT, U_AT_LEVEL
-from .tables import STYLES, Styled, View, listed, plain
+from .tables import STYLES, Styled, Table, View, listed, plain
 
-_VERDICTS = {"better": "good", "worse": "bad", "equivalent": "neutral", "not decided": "unsure"}
+VERDICT_MARKS = {"better": "good", "good": "good", "worse": "bad", "not good": "bad", "equivalent": "neutral"}
 _LITTLE = 0.1  # of the RMS error: a smaller gain of a recalibration is none
 _RMS_ERROR = (
     "RMS error: RMS distance of a pose from its socket, point or board position, after the tip of the tool and the "
@@ -19,8 +19,9 @@ _REAL_SHARE = (
 )
 
 
-def verification_summary(checked: Verification, arm: str, delivered: str) -> dict[str, Any]:
-    """What ``verify`` reports of the nominal arm and the delivered parameters with these names; mm."""
+def verification_summary(checked: Verification, arm: str, delivered: str, scaled: bool = True) -> dict[str, Any]:
+    """What ``verify`` reports of the nominal arm and the delivered parameters with these names, mm; ``scaled`` says
+    whether a certified length, a board or an instrument tests the scale."""
     rows = [
         {"parameters": name} | _accuracy(accuracy) | {"length_errors_mm": plain(errors)}
         for name, accuracy, errors in (
@@ -35,7 +36,7 @@ def verification_summary(checked: Verification, arm: str, delivered: str) -> dic
         "delivered": delivered,
         "verdict": checked.verdict,
         "says": _verdict(checked),
-        "accuracy": rows,
+        "accuracy": [rows[1] | {"parameters": "delivered (nominal)"}] if checked.same else rows,
         "share": dict(zip(("value", "lower", "upper"), share, strict=True)),  # of no difference there is none
         "volume_ratio": {"lower": checked.ratio_lower, "upper": checked.ratio_upper, "margin": MARGIN},
         "probability": checked.probability,
@@ -49,7 +50,16 @@ def verification_summary(checked: Verification, arm: str, delivered: str) -> dic
         "recalibrated_rms_mm": checked.recalibrated,
         "gain_mm": checked.gain,
         "gain_says": _gain(checked),
+        "not_tested": [*_NOT_TESTED, *([] if scaled else ["the scale of the arm: no length is known"])],
     }
+
+
+_NOT_TESTED = (
+    "the tool, the place of the base, and other frames: they were fitted",
+    "what the controller computes: only the stated parameters were tested",
+    "the working volume far from these poses: the errors expected there follow from D-H parameters alone",
+    "other loads, speeds and temperatures, and what changes with time",
+)
 
 
 def _accuracy(accuracy: Accuracy) -> dict[str, Any]:
@@ -66,9 +76,15 @@ def _verdict(checked: Verification) -> str:
     nominal, delivered = checked.nominal, checked.delivered
     of_delivered = f"{delivered.rms:.3g} mm RMS ({LEVEL_IN_PERCENT}: {delivered.lower:.3g} to {delivered.upper:.3g} mm)"
     if checked.same:
-        return f"No difference: in these poses, both sets of parameters are the same, and err by {of_delivered}."
+        left = {
+            "good": f"a calibration with these poses would gain less than {1 - MARGIN:.0%}",
+            "not good": f"a calibration with these poses would leave at least {checked.recalibrated:.2g} mm: calibrate",
+            "not decided": f"these poses do not show whether a calibration would gain more than {1 - MARGIN:.0%}",
+        }[checked.verdict]
+        return f"{checked.verdict.capitalize()}: {of_delivered} in these poses, with the tip fitted; {left}."
     against = (
-        f"with the delivered parameters the tip errs by {of_delivered}, with the nominal ones by {nominal.rms:.3g} mm"
+        f"with the delivered parameters the tip errs by {of_delivered}, with the nominal ones by {nominal.rms:.3g} mm "
+        "(in these poses, with the tip fitted)"
     )
     if checked.verdict == "not decided":
         return (
@@ -77,8 +93,8 @@ def _verdict(checked: Verification) -> str:
         )
     if checked.verdict == "equivalent":
         return (
-            "No difference that matters: over the working volume the errors of the delivered and of the nominal "
-            f"parameters differ by less than {1 - MARGIN:.0%} of the larger; {against}."
+            "No difference that matters (equivalent): over the working volume the errors of the delivered and of the "
+            f"nominal parameters differ by less than {1 - MARGIN:.0%} of the larger; {against}."
         )
     comparison = "better than" if checked.verdict == "better" else "worse than"
     return f"The delivered parameters are {comparison} the nominal ones: {against}."
@@ -88,7 +104,8 @@ def _poses(checked: Verification) -> str:
     """How many poses decide."""
     errors = f"(of two equally good sets, {50 * LEVEL:g} % are called better and {50 * LEVEL:g} % worse)"
     if checked.same:
-        return ""
+        alone = "The delivered parameters are the nominal ones, so that they are compared with a calibration only."
+        return alone + (" Record poses in other places, far apart." if checked.verdict == "not decided" else "")
     if checked.verdict == "equivalent":
         here = checked.verdict_here
         return ("" if here == "not decided" else f"In poses such as these they are {here}. ") + (
@@ -115,31 +132,51 @@ def _gain(checked: Verification) -> str:
     volume = f"Over the working volume, the delivered parameters are expected to err by {checked.volume:.2g} mm RMS"
     if not checked.same:
         volume += f", {checked.ratio_lower:.2g} to {checked.ratio_upper:.2g} times as much as the nominal ones (90 %)"
-    left = f"a calibration with these poses by {checked.recalibrated:.2g} mm"
+    left = f"{volume}, and D-H parameters of a calibration with these poses by at least {checked.recalibrated:.2g} mm"
     if checked.gain > _LITTLE * checked.volume:
-        return f"{volume}, and {left}: it would gain {checked.gain:.2g} mm."
-    return f"{volume}, and {left}: it would gain nothing. More poses, in more places, determine the arm better."
+        return (
+            f"{left}: it would gain {checked.gain:.2g} mm at most. Bending and gear errors, which that leaves out, "
+            "come on top: aacmm calibrate tests its result on held-out poses."
+        )
+    return f"{left}: it would gain nothing. More poses, in more places, determine the arm better."
 
 
-def verification(summary: dict[str, Any]) -> View:
-    """What people see of it."""
-    yield Styled(summary["says"], STYLES[_VERDICTS[summary["verdict"]]])
-    yield from filter(None, (summary["poses_say"], summary["gain_says"]))
+def accuracy_table(summary: dict[str, Any]) -> Table:
+    """The errors by the nominal and the delivered parameters, one row if these are the same."""
 
     def lengths(row: dict[str, Any]) -> str:
         return ", ".join(f"{error:.3f}" for error in row["length_errors_mm"]) or "-"
 
     columns: dict[str, Any] = {
         "parameters": "parameters",
-        "RMS error [mm]": "rms_mm",
+        "RMS error, tip fitted [mm]": "rms_mm",
         U_AT_LEVEL: "expanded_mm",
         "errors of lengths [mm]": lengths,
     }
-    yield listed(f"{summary['arm']}; delivered: {summary['delivered']}", summary["accuracy"], columns)
-    share, real = summary["share"], ""
+    return listed(f"{summary['arm']}; delivered: {summary['delivered']}", summary["accuracy"], columns)
+
+
+def counted(summary: dict[str, Any]) -> str:
+    """The real share, and how many poses, equations and unknowns there are."""
+    share, shared = summary["share"], ""
     if share["value"] is not None:
-        interval = f"{LEVEL_IN_PERCENT}: {share['lower']:.2f} to {share['upper']:.2f}"
-        real = f"Real share of the difference: {share['value']:.2f} ({interval}). "
-    poses = pluralise(summary["poses"], "pose")
-    yield f"{real}{poses}, {summary['equations']} equations, {summary['unknowns']} unknowns."
-    yield f"{_RMS_ERROR} {_REAL_SHARE}" if real else _RMS_ERROR
+        of_share = f"{share['value']:.2f} ({LEVEL_IN_PERCENT}: {share['lower']:.2f} to {share['upper']:.2f})"
+        shared = f"Real share of the difference: {of_share}. "
+    counts = f"{summary['equations']} equations, {summary['unknowns']} unknowns"
+    return f"{shared}{pluralise(summary['poses'], 'pose')}, {counts}."
+
+
+def meaning(summary: dict[str, Any]) -> str:
+    """What the numbers are."""
+    return _RMS_ERROR if summary["share"]["value"] is None else f"{_RMS_ERROR} {_REAL_SHARE}"
+
+
+def verification(summary: dict[str, Any]) -> View:
+    """What people see of it."""
+    yield Styled(summary["says"], STYLES[VERDICT_MARKS.get(summary["verdict"], "unsure")])
+    yield from filter(None, (summary["poses_say"], summary["gain_says"]))
+    yield accuracy_table(summary)
+    yield counted(summary)
+    yield meaning(summary)
+    if "written" in summary:
+        yield f"Written: {summary['written']}"

@@ -71,13 +71,17 @@ def _kind(annotation: object) -> str:
             words.append("table")
         else:
             words.append({float: "number", int: "whole number", str: "text", bool: "true or false"}.get(part, ""))
+    table = re.match(r"(typing\.Annotated\[)?dict\[", text)
+    if table:
+        words.remove("text")  # the keys
     named = list(dict.fromkeys(word for word in words if word))
-    if re.match(r"(typing\.Annotated\[)?dict\[", text):
-        return "table of " + " or ".join(word for word in named if word != "text") if len(named) > 1 else "table"
+    if table:
+        return f"table of {' or '.join(named)}" + (", or lists of these" if "list[" in text else "")
     several = "list: " if re.match(r"(typing\.(Annotated|Optional)\[)*list\[", text) else ""
     if several and len(named) == 1 and not named[0].startswith("`"):
         return "tables" if named == ["table"] else f"list of {named[0]}s"
-    return several + (" or ".join(named) or "date")
+    also = [kind for kind, start in (("list", "list["), ("table", "dict[")) if start in text and not several]
+    return several + (" or ".join(named) or "date") + (f", or a {' or '.join(also)} of these" if also else "")
 
 
 def _argument(model: type[BaseModel], key: str) -> str:

@@ -18,6 +18,7 @@ from ..conftest import command_line
 
 Q = np.array([0, 0.3, 0.4, 0, 1.2, 0]) + np.random.default_rng(0).uniform(-1, 1, (6, 6))  # rad
 DEG = np.pi / 180
+ROBOT = Path(__file__).parents[2] / "examples" / "simulated_robot" / "tracker.toml"
 URDF = Path(__file__).parents[1] / "files" / "six_axis.urdf"
 
 
@@ -175,6 +176,29 @@ def test_columns_of_other_names_and_positions_in_metres(arms):
     run(arms, "m.csv", "-o", "m-out.csv", "--unit", "rad", "--length-unit", "m", *by_name)
     found = [[float(row[name]) for name in names] for row in table(folder / "m-out.csv")]
     np.testing.assert_allclose(found, np.array(corrected[:2], dtype=float), atol=1e-6)
+
+
+@pytest.mark.slow
+def test_positions_are_of_the_tip_or_of_a_target_by_its_name(tmp_path):
+    """The offset of the target was found by the calibration, and is not the tip of the arm."""
+    command_line(tmp_path, "calibrate", ROBOT, "-o", "robot.h5", "--model", "dh", "--no-automatic")
+    record = aj.files.load_calibration(tmp_path / "robot.h5")
+    (target,) = (np.asarray(at) for name, at in record.observed.geometry.items() if name == "offset of ball")
+    nominal, calibrated = record.recording.nominal.arm, record.calibrated.arm
+    q = DEG * np.array([10, 30, 70, 10, 60, 0]) + 0.02 * np.arange(3)[:, None]
+    points = np.asarray(nominal.position(q)) + np.asarray(target) / 2
+    write(tmp_path / "points.csv", ["x", "y", "z"], points)
+    near = f"--near={','.join(str(x) for x in q[0] / DEG)}"
+    for options, tip in (((), (0, 0, 0)), (("--probe", "ball"), target)):
+        command = ("correct", "robot.h5", "points.csv", "-o", "out.csv", "--unit", "deg", near, *options, "--json")
+        summary = json.loads(command_line(tmp_path, *command, "--overwrite").stdout)
+        rows = table(tmp_path / "out.csv")
+        q = DEG * np.array([[float(row[f"q_{i}_deg"]) for i in range(1, 7)] for row in rows])
+        np.testing.assert_allclose(calibrated.replace(probe=tip).position(q), points, rtol=0, atol=1e-3)
+        assert summary["probe_mm"][1] == pytest.approx(list(tip))
+        assert any("give --probe ball" in text for text in summary["warnings"]) == (not options)
+    said = command_line(tmp_path, *command[:-2], "bal", "--overwrite", expect=2).stderr
+    assert "a target of the calibration (ball)" in " ".join(said.split())
 
 
 def test_rows_at_a_singular_wrist_are_named():

@@ -40,6 +40,17 @@ def test_a_good_and_a_bad_delivery(aacmm, robot):
     printed = " ".join(aacmm("verify", "poses.toml", "--delivered", "worse.toml", expect=1).stdout.split())
     for part in ("are worse than the nominal ones", "21 poses", "2.5 % worse", "it would gain", "Real share"):
         assert part in printed
+    aacmm("verify", "poses.toml", "--delivered", "nominal.toml", "-o", "page.html", expect=1)
+    page = (robot / "page.html").read_text("utf-8")
+    for part in (
+        "<b>Not good</b>",
+        "at least",
+        "tip fitted",
+        "What was not tested",
+        "Distance of every pose",
+        "poses.toml",
+    ):
+        assert part in page
     assert "as_found" in aacmm("verify", "poses.toml", expect=2).stderr
 
 

@@ -5,7 +5,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
-from aacmm_jax.pipeline.cross_validation import groups_of
+from aacmm_jax.pipeline.cross_validation import _parts_of, groups_of
 
 from ..calibration.test_observed import BOX, FRAME, NOISE, PLATE, SIMULATED
 
@@ -86,6 +86,21 @@ def test_shared_geometry_is_left_out_together(paper_arm):
     few = aj.simulate(paper_arm, {}, observations=[kinds.SimulatedPoints("T", BOX, 20, FRAME, u=0.01)], noise=NOISE)
     with pytest.raises(aj.InputError, match="observations that fix the scale"):
         aj.cross_validate(paper_arm, few, aj.Bounds.around(paper_arm, aj.Parameters.independent(paper_arm)))
+
+
+def test_a_recording_that_the_user_has_divided_is_held_out_as_divided():
+    """Octants of one station and target; two parts only, or one, are halved in joint space instead."""
+    q, points = np.random.default_rng(0).uniform(-1, 1, (120, 6)), np.zeros((120, 3))
+
+    def held_out(parts):
+        rows = np.array_split(np.arange(120), parts)
+        grid = [kinds.MeasuredPoints(f"grid/{i}", q[r], points[r], u=0.1, station="S") for i, r in enumerate(rows)]
+        return [(names, len(left.readings)) for _, left, names in _parts_of(aj.Capture({}, [], grid))]
+
+    assert held_out(8) == [((f"grid/{i}",), 15) for i in range(8)]
+    assert held_out(2) == [((f"region {i}",), 30) for i in range(1, 5)]
+    assert held_out(1) == [((f"grid/0, region {i}",), 30) for i in range(1, 5)]
+    assert held_out(13) == []
 
 
 @pytest.mark.first_rows(1)

@@ -1,5 +1,8 @@
 """Delivered parameters tested on a handful of poses: verdicts, their error rate, what is counted, and bad input."""
 
+import json
+import re
+
 import numpy as np
 import pytest
 
@@ -103,6 +106,7 @@ def test_what_is_counted():
     measured = aj.verify(recording(nominal, real, 4, [aj.ReferenceLength("A", "B", 100.0, u=0.01)], "AB"), delivered)
     assert (measured.equations, measured.unknowns) == (25, 9)
     assert measured.length_errors.shape == (2, 1)
+    assert abs(measured.length_errors[0, 0]) > 0.05  # between centroids; the fitted positions agree to 0.01 mm
     q = np.random.default_rng(0).uniform(-2, 2, (8, 6))
     seen = aj.data.observations.MeasuredPoints("tracker", q, real.position(q) + 500.0, u=0.02, target="ball")
     tracked = aj.verify(aj.Recording(aj.Capture({}, [], [seen]), ArmSpecification(nominal, "")), delivered)
@@ -110,15 +114,23 @@ def test_what_is_counted():
 
 
 @pytest.mark.slow
-def test_the_same_parameters_are_said_to_be_the_same():
-    nominal, real, _ = arms(4, 1.0, 0.0)
-    checked = aj.verify(recording(nominal, real), nominal)
-    assert (checked.same, checked.verdict, checked.decided_by) == (True, "not decided", None)
-    summary = verification_summary(checked, "arm", "arm")
+def test_the_same_parameters_are_compared_with_a_calibration():
+    """Parameters off by 0.5 mm and 1 mrad are not good, the true ones are, and one row and no infinity tell it."""
+    nominal, real, _ = arms(3, 1.0, 0.0)
+    bad, good = (aj.verify(recording(arm, real), arm) for arm in (nominal, real))
+    assert (bad.same, bad.verdict, bad.decided_by, good.verdict) == (True, "not good", None, "good")
+    assert bad.distances.shape == (2, 24)
+    assert np.sqrt(np.mean(bad.distances[1] ** 2)) == pytest.approx(bad.delivered.rms, rel=0.1)
+    summary = verification_summary(bad, "", "", scaled=False)
     said = " ".join(str(line) for line in verification(summary))
     assert summary["share"] == {"value": None, "lower": None, "upper": None}
-    assert summary["says"].startswith("No difference: in these poses")
+    assert "Infinity" not in json.dumps(summary)
     assert not any(text in said for text in ("inf", "times as much", "Real share"))
+    assert len(summary["accuracy"]) == 1
+    assert re.fullmatch(
+        r"Not good: .* with the tip fitted; a calibration .* at least .* mm: calibrate\.", summary["says"]
+    )
+    assert any("scale" in part for part in summary["not_tested"])
 
 
 def drawn(random: np.random.Generator, share: float, clusters: int = 12) -> tuple[_Rows, _Rows]:

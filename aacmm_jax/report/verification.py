@@ -1,0 +1,44 @@
+"""The page of a verification: whether the maker's calibration is good, for who was not there."""
+
+from typing import Any
+
+from ..data.capture import Capture
+from ..pipeline.verification import Verification
+from ..plot.residuals import arms_chart
+from ..summaries.verification import VERDICT_MARKS, accuracy_table, counted, meaning
+from .elements import DRAWN, Report, Section
+
+
+def verification_report(checked: Verification, capture: Capture, summary: dict[str, Any]) -> Report:
+    """The report of a verification, except for its origin, from its summary."""
+    arms = {"nominal": checked.nominal, "delivered": checked.delivered}
+    shown = {name: distances for name, distances in zip(arms, checked.distances, strict=True)}
+    if checked.same:
+        del arms["nominal"], shown["nominal"]
+    picture = arms_chart(capture, shown, DRAWN)
+    errors = [
+        (f"RMS error, {name}", f"{found.rms:.3g} mm", f"95 %: {found.lower:.3g} to {found.upper:.3g} mm; tip fitted")
+        for name, found in reversed(arms.items())
+    ]
+    volume = ("Expected over the working volume", f"{checked.volume:.2g} mm", "RMS, as delivered")
+    found, not_tested = (summary["poses_say"], summary["gain_says"]), "; ".join(summary["not_tested"])
+    left = f"over the working volume, in place of {checked.volume:.2g} mm"
+    return Report(
+        title=f"Verification of delivered parameters, {summary['arm'] or 'an arm'}",
+        subtitle=f"{counted(summary)} Delivered: {summary['delivered']}",
+        verdict=summary["says"],
+        verdict_mark=VERDICT_MARKS.get(summary["verdict"], "unsure"),
+        warnings=[],
+        numbers=[
+            *errors,
+            *([volume] if checked.same else []),
+            ("After a calibration with these poses", f"at least {checked.recalibrated:.2g} mm", left),
+        ],
+        picture=picture._replace(table=None),
+        one_page=True,
+        facts=[],
+        sections=[
+            Section("found", "What was found", [*filter(None, found), accuracy_table(summary), meaning(summary)]),
+            Section("not-tested", "What was not tested", [not_tested[:1].upper() + not_tested[1:] + "."]),
+        ],
+    )
