@@ -113,8 +113,8 @@ def calibrate(
         "Hold out each placement, station or other group of observations in turn, calibrate with the others, and test "
         "the result on the group held out. Of one group (one tracker and one target), its observations are held out in "
         "turn if the manifest divides it into at least three ('group'), or else regions of joint space "
-        "(from 40 poses on). Default: yes for a recorded capture with several placements of the reference length, unless "
-        "--model, --prior or --robust is given."
+        "(from 40 poses on). Default: yes for a recorded capture with several placements of the reference length, "
+        "unless --model, --prior or --robust is given."
     ),
     leave_out: list[str] | None = option(
         "With --cross-validate: hold out, as one group, all sockets and observations whose names match ('monday/*'); "
