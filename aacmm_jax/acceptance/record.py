@@ -91,7 +91,8 @@ def run(
     secondary sources (`requirements_table` says which, and how certain they are). Decisions: see `decide`. A test says
     what its full procedure would also need, and bears the standard's name (`AcceptanceTest.called`) only where nothing
     that can be checked is missing. `InputError` for points that are not in mm, and for a limit of a metric that these
-    points do not give, or that grows with a length although the metric is not of one.
+    points do not give, or that grows with a length although the metric is not of one; and for the expansion of an
+    artefact whose lengths are already corrected.
 
     Args:
         measured: Points of sockets and spheres, and reference lengths, mm.
@@ -108,6 +109,13 @@ def run(
     """
     measured, influences, given = _checked(measured), checked_influences(influences), checked_limits(limits or {})
     influences = influences._replace(u=math.hypot(influences.u, u_test))
+    twice = next((length for length in measured.lengths if length.corrected), None)
+    if twice is not None and influences.artefact is not None:
+        raise InputError(
+            f"the length '{twice.start}' to '{twice.end}' is already corrected for thermal expansion (temperature_C, "
+            "expansion in [[length]]), and --expansion artefact=... (influences.artefact) would correct it twice; "
+            "leave out one of the two."
+        )
     tests = [result for test in TESTS if (result := test.run(measured, influences)) is not None]
     tests = [test._replace(rule=rule or DEFAULT_RULES[test.standard]) for test in tests]
     if measured.none_held_out:

@@ -2,6 +2,7 @@
 
 import fnmatch
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -279,8 +280,8 @@ def join_sessions(captures: Mapping[str, Capture], *, own_probe: bool = True) ->
         observations += parts[seated:]
         visits |= {f"{session}/{name}": rows for name, rows in visits_of(capture).items() if not probe}
         for length in capture.lengths:
-            ends = f"{session}/{length.start}", f"{session}/{length.end}"
-            lengths.append(ReferenceLength(*ends, length.value, length.u))
+            start, end = f"{session}/{length.start}", f"{session}/{length.end}"
+            lengths.append(replace(length, start=start, end=end))
     return Capture(sockets, lengths, observations, sessions=tuple(captures), visits=visits)
 
 

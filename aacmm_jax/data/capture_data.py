@@ -35,6 +35,7 @@ class ReferenceLength(eqx.Module):
         end: Name of the socket at the other end.
         value: Calibrated length, scalar, mm.
         u: Standard uncertainty (k = 1) of ``value``, scalar, mm.
+        corrected: Whether ``value`` or ``u`` already contains the artefact's thermal expansion.
 
     Raises:
         InputError: Where both ends are one socket, ``value`` is not positive or ``u`` is negative.
@@ -49,8 +50,9 @@ class ReferenceLength(eqx.Module):
     end: str = eqx.field(static=True)
     value: Float[AnyArray, ""]
     u: Float[AnyArray, ""]
+    corrected: bool = eqx.field(static=True)
 
-    def __init__(self, start: str, end: str, value: Numbers, u: Numbers = 0.0):
+    def __init__(self, start: str, end: str, value: Numbers, u: Numbers = 0.0, corrected: bool = False):
         for name in (start, end):
             if not isinstance(name, str):
                 raise InputError(f"an end of a reference length is {shown(name)}; give the name of a socket.")
@@ -60,6 +62,7 @@ class ReferenceLength(eqx.Module):
             raise InputError(f"{where} joins a socket to itself; give two different sockets.")
         self.value = checked(value, _LENGTH, where)
         self.u = checked(u, _UNCERTAINTY, f"u of {where}")
+        self.corrected = bool(corrected)
 
     @classmethod
     def at_temperature(
@@ -90,8 +93,9 @@ class ReferenceLength(eqx.Module):
         if not 0 <= u_temperature < np.inf:
             raise InputError(f"{where} has u_temperature = {u_temperature:g} K; give zero or a positive number.")
         warmer = temperature - REFERENCE_TEMPERATURE
-        parts = (u, value * warmer * u_expansion, value * expansion * u_temperature)
-        return cls(start, end, value * (1 + expansion * warmer), float(np.linalg.norm(parts)))
+        parts = (value * warmer * u_expansion, value * expansion * u_temperature)
+        corrected = any((expansion * warmer, *parts))
+        return cls(start, end, value * (1 + expansion * warmer), float(np.linalg.norm((u, *parts))), corrected)
 
 
 class Repeated(NamedTuple):

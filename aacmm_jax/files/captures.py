@@ -231,7 +231,7 @@ def _recorded(table: Mapping[str, np.ndarray]) -> list[str]:
 def lengths_of(stored: Stored) -> tuple[ReferenceLength, ...]:
     """The reference lengths that a file holds."""
     table = stored.tables["reference"]
-    columns = (table[name].tolist() for name in LENGTHS)
+    columns = (table[name].tolist() for name in LENGTHS if name in table)  # earlier versions: not whether corrected
     return tuple(ReferenceLength(*row) for row in zip(*columns, strict=True))
 
 

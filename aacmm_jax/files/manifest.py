@@ -5,6 +5,7 @@ A manifest of points, instead of poses, is for acceptance tests of arms that rep
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -358,7 +359,7 @@ def _capture(lengths: Sequence[ReferenceLength], observed: Sequence[tuple[str, A
             )
         else:
             start, end = (end.removeprefix(f"{session}/") for end in ends)
-            lengths_of[session].append(ReferenceLength(start, end, length.value, length.u))
+            lengths_of[session].append(replace(length, start=start, end=end))
     captures = {}
     for session, items in by_session.items():
         seats = [item for item in items if isinstance(item, _Seated)]

@@ -38,6 +38,7 @@ LENGTHS: Fields = {
     "end": text("socket at the other end"),
     "value": number("calibrated length", "mm"),
     "u": number("standard uncertainty", "mm", least=0),
+    "corrected": truth("whether the length contains the artefact's thermal expansion"),
 }
 
 # A row for each group of a sphere, whose numbers stand in every one.

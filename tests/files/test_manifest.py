@@ -52,6 +52,17 @@ def test_temperatures(tmp_path, motion):
     np.testing.assert_array_equal(capture.sockets["b"][:, 6], np.full(4, 22.5))
     (found,) = capture.lengths  # 3 K and 11.5 um/(m K): 17.25 um longer
     np.testing.assert_allclose([found.value, found.u], [500.01725, np.hypot(0.001, np.hypot(0.0015, 0.002875))])
+    # The sessions of a file keep that it is corrected, and a test corrects it no second time.
+    recording = aj.files.read_manifest(tmp_path / "capture.toml")
+    recording = recording._replace(capture=aj.join_sessions({"monday": capture}))
+    aj.files.save_capture(tmp_path / "warm.h5", recording)
+    again = aj.acceptance.measured_by(recording.nominal.arm, aj.files.load_capture(tmp_path / "warm.h5"))
+    bar = aj.acceptance.Influences(artefact=aj.acceptance.Expansion(11.5e-6, 1e-6, 23.0, 0.5))
+    assert_refused(
+        lambda: aj.acceptance.run(again, influences=bar), "'monday/warm' to 'monday/b'", "--expansion", "twice"
+    )
+    plain = again._replace(lengths=(aj.ReferenceLength("monday/warm", "monday/b", 500.0),))
+    assert aj.acceptance.run(plain, influences=bar)
     for text, sentence in (
         (SMALL + "temperature_C = 295.6\n", "temperature of 295.6 C, which is not between"),
         (
