@@ -82,7 +82,7 @@ def dcc_xml(
         _administrative(record, administrative_data, day, sources, rules),
         element(
             "measurementResults",
-            results_of(record, administrative_data, command),
+            results_of(record, administrative_data, command, evaluation),
             None if evaluation is None else _acceptance_results(evaluation),
         ),
     )

@@ -9,6 +9,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from scipy.spatial.distance import pdist
 
+from ..acceptance.record import EvaluationRecord
 from ..calibration.evaluation import Evaluation
 from ..calibration.pose_table import HELD_OUT
 from ..calibration.record import CalibrationRecord, uncertainty_of
@@ -16,6 +17,7 @@ from ..core.errors import InputError
 from ..data.capture import ReferenceLength
 from ..data.observations.observation import Quantity, certified_quantities
 from ..data.observations.pixels import Pixels
+from ..diagnostics.joint_travel import tried_poses
 from ..diagnostics.pose_residuals import ObservationResiduals, distances_of, observation_residuals, rms
 from ..files.administrative_data import NOT_STATED, AdministrativeData, Reference
 from ..kinematics.arm import parameter_names, parameter_unit
@@ -65,9 +67,11 @@ _MEASURED = {
 }
 
 
-def results_of(record: CalibrationRecord, given: AdministrativeData, command: str) -> Iterator[Element]:
+def results_of(
+    record: CalibrationRecord, given: AdministrativeData, command: str, evaluation: EvaluationRecord | None = None
+) -> Iterator[Element]:
     """The measurement results of a calibration: by the nominal parameters, by those as found, where they are known,
-    and by the calibrated ones."""
+    and by the calibrated ones. An evaluation verifies a calibration that held no poses out."""
     residuals, temperature = observation_residuals(record), english("text", NOT_STATED)
     if given.certificate.temperature_celsius is not None:
         celsius = real(given.certificate.temperature_celsius, xml.CELSIUS, given.certificate.temperature_u_celsius)
@@ -94,7 +98,7 @@ def results_of(record: CalibrationRecord, given: AdministrativeData, command: st
             xml.software("usedSoftware", command),
             element("measuringEquipments", _equipment(record, given.reference, residuals)),
             element("influenceConditions", named("influenceCondition", "Ambient temperature", status, data)),
-            element("results", _results(record, stage, residuals)),
+            element("results", _results(record, stage, residuals, evaluation)),
             says=says,
         )
 
@@ -215,7 +219,10 @@ def _size(seen: Pixels) -> Quantity:
 
 
 def _results(
-    record: CalibrationRecord, stage: str, residuals: tuple[ObservationResiduals, ...]
+    record: CalibrationRecord,
+    stage: str,
+    residuals: tuple[ObservationResiduals, ...],
+    held_out_by: EvaluationRecord | None,
 ) -> Iterator[Element | None]:
     evaluation, uncertainty, calibrated = record.evaluations()[stage], uncertainty_of(record), stage == "calibrated"
     values = {name: float(getattr(evaluation.repeatability, key)) for name, (key, _) in _METRICS.items()}
@@ -225,16 +232,8 @@ def _results(
             for name, value in values.items()
         )
         yield _result("Repeatability", "Computed over all sockets with more than one pose.", quantities)
-    if calibrated and record.held_out is not None:
-        row = distances_row(residuals_of(record).used_as(HELD_OUT))
-        values = [("poses", row["poses"], ONE), *((name, row[key], MILLIMETRE) for key, name in _HELD_OUT.items())]
-        quantities = (
-            named("quantity", name, real(value, unit, decimals=0 if unit == ONE else _DECIMALS[unit]))
-            for name, value, unit in values
-            if value is not None
-        )
-        says = "Distances of the tip from the geometry, in poses that the parameters were not identified from."
-        yield _result("Held-out poses", says, quantities)
+    if calibrated:
+        yield _held_out(record, held_out_by)
     if record.recording.capture.lengths:
         yield _lengths(record, evaluation, calibrated, uncertainty)
     if not record.sockets_alone:
@@ -258,12 +257,29 @@ def _results(
         )
 
 
+def _held_out(record: CalibrationRecord, evaluation: EvaluationRecord | None) -> Element | None:
+    """Distances of held-out poses; of those of an evaluation where the calibration has none."""
+    says = "Distances of the tip from the geometry, in poses that the parameters were not identified from."
+    source = record if record.held_out is not None else evaluation
+    if source is evaluation:
+        says += " The positions of the sockets, and other geometry, were determined from these poses."
+    if source is None or (isinstance(source, EvaluationRecord) and source.uncertainty is None):
+        return None
+    row = distances_row(residuals_of(source).used_as(HELD_OUT))
+    values = [("poses", row["poses"], ONE), *((name, row[key], MILLIMETRE) for key, name in _HELD_OUT.items())]
+    quantities = (
+        named("quantity", name, real(value, unit, decimals=0 if unit == ONE else _DECIMALS[unit]))
+        for name, value, unit in values
+        if value is not None
+    )
+    return _result("Held-out poses", says, quantities) if row["poses"] else None
+
+
 def _volume(record: CalibrationRecord, uncertainty: Uncertainty) -> Element | None:
     """Expanded uncertainties of tips and lengths, in both regions, where the data determine them."""
-    everywhere, rows = volumetric_uncertainty(uncertainty), []
+    everywhere, rows, poses = volumetric_uncertainty(uncertainty), [], np.asarray(record.recording.capture.readings)
     regions = {"over all joint limits": everywhere.summary}
     with contextlib.suppress(InputError):  # where no two poses are as far apart as the length
-        poses = np.asarray(record.recording.capture.readings)
         near = volumetric_uncertainty(uncertainty, length=everywhere.length, near=poses).summary
         regions = {"where poses were taken": near} | regions
     for (region, volume), (name, key) in itertools.product(regions.items(), _OVER_VOLUME.items()):
@@ -277,6 +293,10 @@ def _volume(record: CalibrationRecord, uncertainty: Uncertainty) -> Element | No
         "Expanded uncertainties by the calibration, in poses of the calibration and in random poses within the joint "
         "limits: of the tip, in its worst direction; and of a measured length, with the noise of both readings."
     )
+    if rows and len(poses) > 1:
+        covered = tried_poses(record.calibrated.arm, poses, everywhere.q).tried.mean()
+        share = "Share of the random poses as near to a pose of the calibration as these are to one another"
+        rows.append(named("quantity", "covered", real(covered, ONE, decimals=2), says=share))
     return _result("Expanded uncertainty", says, *rows) if rows else None
 
 
@@ -315,7 +335,8 @@ def _lengths(record: CalibrationRecord, evaluation: Evaluation, calibrated: bool
     return _result(
         "Reference lengths",
         "An error is the measured value minus the calibrated one; the uncertainty of the error includes the "
-        "uncertainty of the calibrated value and the scatter of the poses at both ends.",
+        "uncertainty of the calibrated value and the scatter of the poses at both ends. Where thermal expansion is "
+        "stated, the calibrated value is the length of the artefact at the temperature of the measurement.",
         *rows,
     )
 

@@ -1,7 +1,8 @@
 """What the two pages of a printed certificate say, made of a Digital Calibration Certificate (DCC) and nothing else.
 
-What is printed is a choice of what the DCC says, to the digit. Its words are those of a language file; sentences that
-the DCC has in English only are printed in English alone, and other languages refer to them.
+What is printed is a choice of what the DCC says: to the digit what has an uncertainty, the rest shorter. Its words are
+those of a language file; sentences that the DCC has in English only are printed in English alone, and other languages
+refer to them.
 """
 
 import re

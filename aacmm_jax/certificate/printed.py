@@ -16,7 +16,7 @@ from .pages import Pages, pages_of
 from .sections import Section
 
 _FOLDER = Path(__file__).parent
-_TYPE_SIZES = (10.0, 9.2, 8.5, 7.8)  # points, the first with which two pages are enough
+_TYPE_SIZES = (10.0, 9.2, 8.5, 7.8, 7.0)  # points, the first with which two pages are enough
 # Of a sheet of the HTML page in a wide font: the largest type and its height in points, ems above the first part, and
 # characters of a line in 10 points.
 _LARGEST, _HEIGHT, _ABOVE, _CHARACTERS = 8.8, 760, 8, 80
@@ -57,7 +57,7 @@ class PrintedCertificate(NamedTuple):
     def pdf(self) -> bytes:
         """PDF/A-3 with the DCC attached as dcc.xml. The same input gives the same bytes.
 
-        The type is as small as two pages need, down to 7.8 points. `InputError` if Typst is not installed, a logo
+        The type is as small as two pages need, down to 7 points. `InputError` if Typst is not installed, a logo
         cannot be drawn, or no font has a character of a name.
         """
         require("certificate", "a certificate as PDF")

@@ -20,11 +20,12 @@ from .sections import (
     number_of,
     shortened,
     value_of,
+    without_u,
 )
 from .xml_elements import PREFIXES
 
 _MOST_FINDINGS, _MOST_JOINTS = 4, 8  # the certificate has two pages
-_MOST_CHARACTERS = 280  # of a finding
+_MOST_CHARACTERS, _MOST_MISSING = 280, 100  # of a finding, and of what a procedure lacks
 _COLUMNS = ("alpha", "a", "d", "theta", "beta")
 _STAGES = {"nominal": "nominal parameters", "as_found": "parameters as found", "after": "calibrated parameters"}
 # Of verdicts, the worst first.
@@ -42,11 +43,6 @@ def results_page(results: dict[str, Element], statements: dict, words: Language)
     yield from _volume(stages[1], words)
     yield from _parameters(stages[1], words("parameters"), words)
     yield from _parameters(stages[0], words("parameters_before", before=words(before)), words)
-    if "Scale" in stages[1]:
-        k = first(stages[1]["Scale"], "dcc:data/dcc:quantity")
-        expanded, factor = expanded_of(k)
-        says = words.number(value_of(k) + (f" ± {expanded} (k = {factor})".replace(" ", "\u00a0") if expanded else ""))
-        yield Section(words("scale"), paragraphs=[words("scale_sentence", k=says)])
     tests = [named_in(results.get(f"Acceptance tests, {_STAGES[stage]}"), "dcc:results/dcc:result")
              for stage in (before, "after")]  # fmt: skip
     called = dict.fromkeys(name.partition(": ")[0] for name in tests[1])
@@ -112,7 +108,7 @@ def _repeatability(stages: list[dict[str, Element]], before: str, words: Languag
         yield Section(
             words("repeatability"),
             headings=[words("quantity"), words(before), words("after")],
-            table=[[words(name), *(number_of(stage.get(name), words) for stage in rows)] for name in rows[1]],
+            table=[[words(name), *(without_u(stage.get(name), words) for stage in rows)] for name in rows[1]],
         )
 
 
@@ -129,8 +125,13 @@ def _lengths(stages: list[dict[str, Element]], before: str, words: Language) -> 
         rows.append((size, [name, *cells, words.number(expanded), words.number(factor)]))
     before_and_after = words("error_before", before=words(before)), words("error")
     headings = words("length"), words("certified_value"), *before_and_after, "U", "k"
-    note = [words("by_construction_sentence")] if by_construction else []
-    yield from _largest(words("lengths"), headings, rows, words, notes=note)
+    notes = [words("by_construction_sentence")] if by_construction else []
+    if "Scale" in stages[1]:
+        k = first(stages[1]["Scale"], "dcc:data/dcc:quantity")
+        expanded, factor = expanded_of(k)
+        says = value_of(k) + (f" ± {expanded} (k = {factor})".replace(" ", "\u00a0") if expanded else "")
+        notes.append(words("scale_sentence", k=words.number(says)))
+    yield from _largest(words("lengths"), headings, rows, words, notes=notes)
 
 
 def _observations(stages: list[dict[str, Element]], before: str, words: Language) -> Iterator[Section]:
@@ -141,7 +142,7 @@ def _observations(stages: list[dict[str, Element]], before: str, words: Language
         size = 0.0 if both[1] is None else float(value_of(both[1]))
         kind, *_, poses = re.split("[,;] ", content(part, "dcc:description"))
         counted = poses.removesuffix(" poses")
-        rows.append((size, [name, words.known(f"kind_{kind}", kind), counted, *(number_of(x, words) for x in both)]))
+        rows.append((size, [name, words.known(f"kind_{kind}", kind), counted, *(without_u(x, words) for x in both)]))
     headings = words("observation"), words("kind"), words("poses"), words(before), words("after")
     yield from _largest(words("observations"), headings, rows, words, texts=2)
 
@@ -166,18 +167,24 @@ def _largest(
 def _held_out(stage: dict[str, Element], words: Language) -> Iterator[Section]:
     quantities = named_in(stage.get("Held-out poses"), "dcc:data/dcc:quantity")
     if quantities:
-        row = [[number_of(quantity, words) for quantity in quantities.values()]]
-        yield Section(words("held_out"), headings=[words(name) for name in quantities], table=row, texts=0)
+        shown = (f"{words(name)}: {without_u(x, words)}" for name, x in quantities.items() if name != "poses")
+        poses = f"{number_of(quantities['poses'], words)} {words('poses')}"
+        yield Section(words("held_out"), paragraphs=["; ".join([poses, *shown])])
 
 
 def _volume(stage: dict[str, Element], words: Language) -> Iterator[Section]:
     rows, statistics = [], ("median", "95th percentile", "largest")
-    for name, part in named_in(stage.get("Expanded uncertainty"), "dcc:data/dcc:list").items():
+    result = stage.get("Expanded uncertainty")
+    for name, part in named_in(result, "dcc:data/dcc:list").items():
         quantities = named_in(part, "dcc:quantity")
         says = words(name, length=number_of(quantities.get("length"), words).removesuffix(words.number(".0")))
         rows.append([says, *(number_of(quantities[key], words) for key in statistics)])
+    notes = [
+        words("covered_sentence", percent=f"{100 * float(value_of(share)):.0f}")
+        for share in named_in(result, "dcc:data/dcc:quantity").values()
+    ]
     if rows:
-        yield Section(words("volume"), headings=[words("quantity"), *map(words, statistics)], table=rows)
+        yield Section(words("volume"), headings=[words("quantity"), *map(words, statistics)], table=rows, notes=notes)
 
 
 def _parameters(stage: dict[str, Element], title: str, words: Language) -> Iterator[Section]:
@@ -197,12 +204,17 @@ def _parameters(stage: dict[str, Element], title: str, words: Language) -> Itera
     if shown:
         tip = [f"{axis}: {shown.get(f'probe_{axis}', '')}" for axis in "xyz"]
         rows.append([words("probe"), *tip, *[""] * (len(columns) - 3)])
-    notes = []
-    if factors:
+    described = content(stage.get("Denavit-Hartenberg parameters"), "dcc:description")
+    convention = re.search(r"Standard convention; the transform of a joint is ([^.]*)\.", described)
+    sentences = []
+    if convention and factors:  # said once
         stated = dict.fromkeys(f"{factor:g}" for factor in (min(factors), max(factors)))
-        notes.append(words("parameters_sentence", factors=words.number(" – ".join(stated))))
-        notes += more(len(quantities) - len(shown), words)
-    yield Section(title, headings=[words("joint"), *columns], table=rows if shown else [], notes=notes)
+        sentences = [
+            words("convention_sentence", transform=convention[1].removesuffix(" Ry(beta)" if zero else "")),
+            words("parameters_sentence", factors=words.number(" – ".join(stated))),
+            *more(len(quantities) - len(shown), words),
+        ]
+    yield Section(title, headings=[words("joint"), *columns], table=rows if shown else [], notes=[" ".join(sentences)])
 
 
 def _tests(
@@ -211,10 +223,13 @@ def _tests(
     """The worst value of each metric of the tests by a standard, whose names are "standard: title"."""
     edition = standard.removeprefix("based on ")
     incomplete = edition != standard
-    rows, factors = [], {}
+    rows, factors, missing = [], {}, {}
     for name, test in tests.items():
         first = named_in(earlier.get(name), "dcc:data/dcc:list")
         metrics = named_in(test, "dcc:data/dcc:list") if name.partition(": ")[0] == standard else {}
+        if metrics:
+            lacking = content(test, "dcc:description").partition("not carried out. ")[2]
+            missing |= {lacking.partition(" Expanded uncertainties")[0]: None}
         for symbol, metric in metrics.items():
             worst = _worst(metric.findall("dcc:quantity", PREFIXES))
             was = _worst(first[symbol].findall("dcc:quantity", PREFIXES)) if symbol in first else None
@@ -229,15 +244,17 @@ def _tests(
             ]
             says = words("metric_" + re.split("[.:]", symbol)[0])
             rows.append([symbol, says, *numbers, words(verdict) if verdict else "–"])
+    sentences, lacking = [words("tests_sentence", factor=words.number(next(iter(factors), "2")))], " ".join(missing)
+    if incomplete:
+        short = words.code == "en" and len(lacking) <= _MOST_MISSING
+        sentences.append(words("incomplete_sentence", standard=edition))
+        sentences.append(lacking if short else words("missing_sentence"))
     return Section(
         words("tests", standard=words("based_on", standard=edition) if incomplete else edition),
         headings=[words("quantity"), "", words(before), words("after"), "U", words("limit"), words("decision")],
         table=rows,
         texts=2,
-        notes=[
-            words("tests_sentence", factor=words.number(next(iter(factors), "2"))),
-            *([words("incomplete_sentence", standard=edition)] if incomplete else []),
-        ],
+        notes=[" ".join(sentences)],
     )
 
 

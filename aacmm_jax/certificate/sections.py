@@ -6,7 +6,7 @@ from xml.etree.ElementTree import Element
 
 from ..core.errors import InputError
 from .languages import Language
-from .xml_elements import CELSIUS, MILLIMETRE, ONE, PREFIXES, RADIAN
+from .xml_elements import CELSIUS, MILLIMETRE, ONE, PREFIXES, RADIAN, decimals_of, rounded
 
 MOST_ROWS = 6  # of a table: the certificate has two pages
 VALUE, UNCERTAINTY = "si:real/si:value", "si:real/si:measurementUncertaintyUnivariate/"
@@ -73,8 +73,15 @@ def number_of(quantity: Element | None, words: Language) -> str:
     return "" if quantity is None else words.number(value_of(quantity))
 
 
+def without_u(quantity: Element | None, words: Language) -> str:
+    """A value that has no uncertainty, with three digits, "" where there is none."""
+    value = None if quantity is None else float(value_of(quantity))
+    return "" if value is None else words.number(rounded(value, decimals_of(value) + 1))
+
+
 def with_u(quantity: Element, words: Language) -> str:
-    """A value with its unit and standard uncertainty, as they were given."""
+    """A value with its unit and standard uncertainty, as they were given; u in more than two digits is rounded to two,
+    and the value to them."""
     unit = quantity.findtext("si:real/si:unit", "", PREFIXES)
     unit = _UNITS.get(unit, unit)
     name = content(quantity, "dcc:name")
@@ -82,8 +89,13 @@ def with_u(quantity: Element, words: Language) -> str:
         number, unit = f"{float(value_of(quantity)):.2g}", "px" if name.endswith("in pixels") else unit
         return f"u = {words.number(number)} {unit}".replace(" ", "\u00a0")
     u = quantity.findtext(f"{UNCERTAINTY}si:standardMU/si:valueStandardMU", "", PREFIXES)
-    with_u = f" (u = {words.number(shortened(u))} {unit})".replace(" )", ")") if u else ""
-    return f"{words.number(value_of(quantity))} {unit}{with_u}".strip().replace(" ", "\u00a0")
+    value = value_of(quantity)
+    if u and float(f"{float(u):.1e}") != float(u):
+        decimals = decimals_of(float(u))
+        u = rounded(float(u), decimals)
+        value = rounded(float(value), decimals) if len(value.partition(".")[2]) > decimals else value
+    with_u = f" (u = {words.number(u)} {unit})".replace(" )", ")") if u else ""
+    return f"{words.number(value)} {unit}{with_u}".strip().replace(" ", "\u00a0")
 
 
 def more(count: int, words: Language) -> list[str]:

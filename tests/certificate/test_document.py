@@ -143,7 +143,8 @@ def test_elements_are_in_the_order_of_the_schema(certificates, kind):
     observations = kind == "observations"
     assert found == ["Repeatability", "Observations" if observations else "Reference lengths", PARAMETERS]
     later = ["Expanded uncertainty", "Covariance matrix", *([] if observations else ["Scale"])]
-    assert left == [*found, *later]
+    held_out = ["Held-out poses"] if kind == "all stated" else []  # those of its evaluation
+    assert left == [found[0], *held_out, *found[1:], *later]
 
 
 def two_digits(found, value: float, expanded: float) -> None:
@@ -196,8 +197,9 @@ def test_numbers_read_back(record):
     k = values["Calibrated parameters", "Scale", "k"]
     two_digits(k, record.k, uncertainty.expanded_k())
     # Three metrics, three numbers for each of two lengths, and 27 parameters, twice; the scale; a length, and
-    # three statistics of tips and of such lengths, in both regions.
-    assert len(values) == 2 * (3 + 6 + 27) + 1 + 2 * 2 * 4
+    # three statistics of tips and of such lengths, in both regions; and how much of the joint space poses cover.
+    assert len(values) == 2 * (3 + 6 + 27) + 1 + 2 * 2 * 4 + 1
+    assert 0 < values["Calibrated parameters", "Expanded uncertainty", "covered"].value <= 1
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.certificate import languages, printed_certificate
+from aacmm_jax.certificate import languages, printed_certificate, sections, xml_elements
 from tests.certificate import dcc_model
 from tests.certificate.conftest import KINDS
 from tests.refusals import assert_refused
@@ -142,6 +142,37 @@ def test_findings_are_printed_in_english_and_counted_in_other_languages(certific
     assert sum(text in english for text in beginnings) == min(len(found), 4)
     assert not any(text in german for text in beginnings)
     assert ("HinweisederAuswertung" in german) == bool(found)
+
+
+@pytest.mark.slow
+def test_results_say_what_they_apply_to(certificates):
+    """Convention, coverage of the joint space, held-out poses of the evaluation."""
+    texts = Texts(page(certificates["all stated"], "en")).texts
+    convention = "Standard Denavit-Hartenberg convention; transform of a joint: Rz(q + theta) Tz(d) Tx(a) Rx(alpha)."
+    assert sum(text.startswith(convention) for text in texts) == 1
+    assert sum("of the joint space is covered" in text for text in texts) == 1
+    values = aj.certificate.parse_dcc(certificates["all stated"])
+    held_out = {key[2]: value.value for key, value in values.items() if key[1] == "Held-out poses"}
+    assert held_out["poses"] == 15
+    assert 0.5 < held_out["RMS distance"] / held_out["RMS distance, predicted"] < 2
+    assert not [key for key in aj.certificate.parse_dcc(certificates["nothing stated"]) if key[1] == "Held-out poses"]
+
+
+@pytest.mark.parametrize(
+    ("value", "u", "printed"),
+    [
+        (469.04351, 0.002071992, "469.0435 mm (u = 0.0021 mm)"),
+        (469.0435, 0.002, "469.0435 mm (u = 0.002 mm)"),
+        (20.25, 0.1, "20.25 mm (u = 0.1 mm)"),
+        (500.0, 0.00299, "500.0 mm (u = 0.0030 mm)"),
+        (500.002, None, "500.002 mm"),
+    ],
+)
+def test_a_certified_value_is_rounded_to_two_digits_of_its_u(value, u, printed):
+    parent = ElementTree.Element("x", {f"xmlns:{prefix}": uri for prefix, uri in xml_elements.PREFIXES.items()})
+    parent.append(xml_elements.named("quantity", "value", xml_elements.real(value, xml_elements.MILLIMETRE, u)))
+    quantity = ElementTree.fromstring(xml_elements.xml_text(parent))[0]
+    assert sections.with_u(quantity, languages.language_of("en")) == printed.replace(" ", "\u00a0")
 
 
 def test_one_is_singular():
