@@ -214,7 +214,7 @@ def _parameters(stage: dict[str, Element], title: str, words: Language) -> Itera
             words("parameters_sentence", factors=words.number(" – ".join(stated))),
             *more(len(quantities) - len(shown), words),
         ]
-    yield Section(title, headings=[words("joint"), *columns], table=rows if shown else [], notes=[" ".join(sentences)])
+    yield Section(title, headings=[words("joint"), *columns], table=rows if shown else [], notes=[" ".join(sentences)] if sentences else [])
 
 
 def _tests(
