@@ -5,7 +5,7 @@ import uuid
 from collections.abc import Iterator, Sequence
 from xml.etree.ElementTree import Element
 
-from ..acceptance.judgement import RULES, worst
+from ..acceptance.judgement import RULES, Rule, worst
 from ..acceptance.record import EvaluationRecord, same_arm
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
 from ..calibration.record import REPEATABILITY, CalibrationRecord
@@ -70,7 +70,7 @@ def dcc_xml(
             f"a certificate cannot be issued: k = {record.k:.6g} is not a plausible scale of an arm; correct the "
             "values of the reference lengths and calibrate again."
         )
-    _check_evaluation(record, administrative_data, evaluation)
+    rules = _check_evaluation(record, administrative_data, evaluation)
     try:
         day = datetime.datetime.fromisoformat(record.recording.measured or created).date()
     except ValueError as error:
@@ -79,7 +79,7 @@ def dcc_xml(
         ) from error
     root = element(
         "digitalCalibrationCertificate",
-        _administrative(record, administrative_data, day, sources),
+        _administrative(record, administrative_data, day, sources, rules),
         element(
             "measurementResults",
             results_of(record, administrative_data, command),
@@ -97,23 +97,30 @@ def dcc_xml(
 
 def _check_evaluation(
     record: CalibrationRecord, administrative_data: AdministrativeData, evaluation: EvaluationRecord | None
-) -> None:
+) -> list[Rule]:
+    """Refuse what the evaluation contradicts; the rules by which it was decided."""
     simulated = record.recording.true is not None
     if evaluation is None:
         check_conformity(
             administrative_data, simulated=simulated, needed="give an evaluation with limits (--evaluation)"
         )
-        return
+        return []
     if not same_arm(record.calibrated.arm, evaluation.calibrated.arm):
         raise InputError("the evaluation belongs to another calibration; run aacmm evaluate with this calibration.")
     simulated |= evaluation.recording.true is not None
     tests = evaluation.acceptance()["calibrated"]
+    rules: list[Rule] = [test.rule for test in tests if test.decision is not None]
     decision = worst([test.decision for test in tests if test.decision is not None])
-    check_conformity(administrative_data, simulated=simulated, decision=decision)
+    check_conformity(administrative_data, simulated=simulated, decision=decision, rules=rules)
+    return rules
 
 
 def _administrative(
-    record: CalibrationRecord, given: AdministrativeData, day: datetime.date, sources: Sequence[str]
+    record: CalibrationRecord,
+    given: AdministrativeData,
+    day: datetime.date,
+    sources: Sequence[str],
+    rules: Sequence[Rule],
 ) -> Element:
     """The administrative data, with the unique identifier still empty."""
     name = given.item.name or record.recording.nominal.name or "articulated-arm coordinate measuring machine"
@@ -140,7 +147,7 @@ def _administrative(
         ),
         element("respPersons", persons or element("respPerson", named("person", NOT_STATED))),
         xml.contact("customer", given.customer),
-        element("statements", _statements(record, given, sources)),
+        element("statements", _statements(record, given, sources, rules)),
     )
 
 
@@ -178,7 +185,9 @@ def _core(administrative_data: AdministrativeData, day: datetime.date) -> Elemen
     )
 
 
-def _statements(record: CalibrationRecord, given: AdministrativeData, sources: Sequence[str]) -> Iterator[Element]:
+def _statements(
+    record: CalibrationRecord, given: AdministrativeData, sources: Sequence[str], rules: Sequence[Rule]
+) -> Iterator[Element]:
     if record.recording.true is not None:
         yield _statement("Simulation", "The readings are simulated, so this is not a certificate of a real arm.")
     scale, traceable = "the reference lengths alone", "the reference lengths"
@@ -201,7 +210,7 @@ def _statements(record: CalibrationRecord, given: AdministrativeData, sources: S
     if given.conformity is not None:
         stated = given.conformity
         verdict = element("conformity", stated.verdict)
-        yield _statement("Conformity", stated.decision_rule, verdict, norm=stated.specification)
+        yield _statement("Conformity", stated.decided_by(rules), verdict, norm=stated.specification)
     if given.certificate.remarks is not None:
         yield named("statement", "Remarks", text("declaration", given.certificate.remarks))
 

@@ -55,16 +55,31 @@ def results_page(results: dict[str, Element], statements: dict, words: Language)
     norms = {
         norm.text: None for test in tests[1].values() for norm in test.iterfind(".//dcc:metaData/dcc:norm", PREFIXES)
     }
-    rules = [words(key) for key, text in RULES.items() if text in norms]
-    facts = [(words("decision_rule"), "; ".join(rules))] if rules else []
+    rule, facts = "; ".join(text for text in RULES.values() if text in norms), []
     for stated in statements.get("Conformity", ()):
+        rule = content(stated, "dcc:declaration")
         facts = [
             (words("specification"), stated.findtext("dcc:norm", "", PREFIXES)),
-            (words("decision_rule"), content(stated, "dcc:declaration")),
             (words("verdict"), words(stated.findtext("dcc:conformity", "", PREFIXES))),
         ]
+    for key, text in RULES.items():
+        rule = rule.replace(text, words(key))
+    if rule:
+        facts[1:1] = [(words("decision_rule"), rule), (words("limits"), _limits(tests[1].values(), words))]
     yield Section(words("conformity"), facts, [] if facts else [words("no_conformity_sentence")])
     yield from _findings(statements, words)
+
+
+def _limits(tests: Iterable[Element], words: Language) -> str:
+    """The limits by which values were decided; from the least to the largest where they grow with a length."""
+    limits = {}
+    for test in tests:
+        for symbol, metric in named_in(test, "dcc:data/dcc:list").items():
+            numbers = {limit for x in metric.iterfind("dcc:quantity", PREFIXES) if (limit := _limit(x)[0])}
+            limits.setdefault(symbol, set()).update(numbers)
+    ends = {key: dict.fromkeys(shortened(f(x, key=float)) for f in (min, max)) for key, x in limits.items() if x}
+    stated = (f"{symbol} {words.number(' – '.join(both))} mm" for symbol, both in ends.items())
+    return "; ".join(text.replace(" ", "\u00a0") for text in stated)
 
 
 def _findings(statements: dict, words: Language) -> Iterator[Section]:

@@ -4,11 +4,13 @@ import datetime
 import itertools
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, FiniteFloat, model_validator
 
+from ..acceptance.judgement import RULES, Rule
 from ..core.errors import InputError
 from .inputs import open_input
 from .toml import Strict, read_toml
@@ -18,6 +20,12 @@ NO_COUNTRY = "ZZ"  # reserved for users by ISO 3166-1: a certificate must have a
 
 _LARGEST_LOGO, _MOST_PIXELS, _PNG = 1_000_000, 10_000_000, b"\x89PNG\r\n\x1a\n"  # bytes, pixels
 # All but the characters of XML 1.0, production 2.
+# What people call the decision rules; both editions of ISO 14253-1 where none is named.
+_CALLED: dict[Rule, str] = {
+    "iso-2017": "iso-2017|14253(?!.*2013)",
+    "iso-2013": "iso-2013|14253(?!.*2017)",
+    "simple": r"simple|einfache|b89\.7\.3\.1|shared risk",
+}
 _NOT_IN_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
@@ -128,11 +136,20 @@ class Certificate(Strict):
 
 
 class Conformity(Strict):
-    """A statement of conformity: the verdict, the specification it is about, and the rule by which it was decided."""
+    """A statement of conformity: the verdict, the specification it is about, and the rule by which it was decided.
+
+    The rule is that of the evaluation; ``decision_rule`` may add to it, but not name another one.
+    """
 
     verdict: Literal["pass", "fail", "conditionalPass", "conditionalFail", "noPass", "noFail"]
     specification: Text
-    decision_rule: Text
+    decision_rule: Text | None = None
+
+    def decided_by(self, rules: Sequence[Rule]) -> str:
+        """The rules of an evaluation in words, and what is stated about them besides."""
+        words = "; ".join(dict.fromkeys(RULES[rule] for rule in rules))
+        stated = self.decision_rule or ""
+        return words if stated in words else "; ".join(filter(None, (words, stated)))
 
 
 class AdministrativeData(Strict):
@@ -204,10 +221,15 @@ def read_logo(path: str | os.PathLike) -> bytes | None:
 
 
 def check_conformity(
-    about: AdministrativeData, *, simulated: bool, decision: str | None = None, needed: str = ""
+    about: AdministrativeData,
+    *,
+    simulated: bool,
+    decision: str | None = None,
+    rules: Sequence[Rule] = (),
+    needed: str = "",
 ) -> None:
     """Refuse a statement of conformity of a simulated arm, one without a test in the file (``needed``: what would be
-    one), and one that contradicts the decision of the tests."""
+    one), and one that contradicts the decision of the tests or names another rule than theirs."""
     if about.conformity is None:
         return
     verdict = about.conformity.verdict
@@ -224,4 +246,12 @@ def check_conformity(
         raise InputError(
             f"conformity.verdict is '{verdict}', but in this evaluation "
             f"{results.get(decision or '', 'no limit was given')}; correct the verdict."
+        )
+    stated = about.conformity.decision_rule or ""
+    named = {rule for rule, called in _CALLED.items() if re.search(called, stated, re.IGNORECASE)}
+    if rules and named and named.isdisjoint(rules):
+        raise InputError(
+            f"conformity.decision_rule is '{stated}', but the evaluation was decided by "
+            f"{'; '.join(RULES[rule] for rule in dict.fromkeys(rules))}; remove decision_rule, or evaluate again with "
+            f"--rule {min(named)}."
         )

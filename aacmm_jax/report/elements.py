@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
+from ..acceptance.judgement import Rule
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord
 from ..core.numpy_or_jax import AnyArray
@@ -98,6 +99,7 @@ class Report(NamedTuple):
     simulated: bool = False
     one_page: bool = False  # printed smaller, to fit
     decision: str | None = None  # of its acceptance tests, all together
+    rules: Sequence[Rule] = ()  # by which they were decided
     administrative: Sequence[tuple[str, list[tuple[str, str]]]] = ()  # groups of titles and values
 
     @property

@@ -76,6 +76,7 @@ def evaluation_report(record: EvaluationRecord) -> Report:
         ],
         simulated=record.recording.true is not None,
         decision=overall_decision(summary),
+        rules=[test.rule for test in tests["calibrated"] if test.decision is not None],
     )
 
 
@@ -108,6 +109,7 @@ def points_report(record: PointsRecord) -> Report:
             *([] if chart is None else [Section("lengths", "Lengths", [chart])]),
         ],
         decision=overall_decision(summary),
+        rules=[test.rule for test in tests if test.decision is not None],
     )
 
 

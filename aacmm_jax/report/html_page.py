@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..acceptance.judgement import Rule
 from ..acceptance.procedure import Procedure
 from ..acceptance.record import SIMULATED
 from ..core.errors import require
@@ -94,8 +95,14 @@ def write_report(
             report = report._replace(warnings=warnings, verdict_mark=mark)
         if administrative_data is not None:
             needed = "" if kind == "evaluation" else "write the report of an evaluation with limits"
-            check_conformity(administrative_data, simulated=report.simulated, decision=report.decision, needed=needed)
-            report = report._replace(administrative=_administrative(administrative_data))
+            check_conformity(
+                administrative_data,
+                simulated=report.simulated,
+                decision=report.decision,
+                rules=report.rules,
+                needed=needed,
+            )
+            report = report._replace(administrative=_administrative(administrative_data, report.rules))
         return _written(report, _origin(read, attributes), target) | {"of": str(source)}
 
 
@@ -301,7 +308,7 @@ def _stacked(table: Table, cells: list[list[Cell]]) -> bool:
     return characters * _CHARACTER + _GAP * len(texts) > _NARROW
 
 
-def _administrative(given: AdministrativeData) -> list[tuple[str, list[tuple[str, str]]]]:
+def _administrative(given: AdministrativeData, rules: Sequence[Rule]) -> list[tuple[str, list[tuple[str, str]]]]:
     """Groups of titles and values of the administrative data."""
 
     def stated(part: str, key: str) -> str:
@@ -332,7 +339,7 @@ def _administrative(given: AdministrativeData) -> list[tuple[str, list[tuple[str
         groups.append((title, [("", line) for line in lines or [NOT_STATED]]))
     if given.conformity is not None:
         conformity = given.conformity
-        words = f"{conformity.verdict}: {conformity.specification}; {conformity.decision_rule}"
+        words = f"{conformity.verdict}: {conformity.specification}; {conformity.decided_by(rules)}"
         groups.append(("Statement of conformity", [("", words)]))
     return groups
 

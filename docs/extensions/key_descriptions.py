@@ -214,7 +214,7 @@ DESCRIPTIONS = {
     "temperature_celsius": "Temperature, C.",
     "verdict": "The verdict.",
     "specification": "Specification to which the statement refers, such as a standard and the maker's limits.",
-    "decision_rule": "Decision rule of the statement.",
+    "decision_rule": "Decision rule of the statement. Default: that of the evaluation, which it must not contradict.",
     # Where one key is several things
     "IdentificationTable.start": "Start of the search: the nominal arm, or random values within the bounds.",
     "Certificate.end": "Last day of the calibration.",

@@ -22,6 +22,7 @@ from aacmm_jax.files.administrative_data import (
     Laboratory,
     Person,
     Reference,
+    check_conformity,
     read_administrative_data,
 )
 from aacmm_jax.kinematics import corrections as kinds
@@ -281,6 +282,33 @@ def test_a_conformity_rests_on_results(record, full, evaluation):
     assert "<dcc:conformity>" not in text
     other = evaluation._replace(calibrated=record.recording.nominal)
     assert_refused(certificate(other, "pass"), "another calibration")
+
+
+@pytest.mark.parametrize(
+    ("stated", "used", "printed"),
+    [
+        (None, "iso-2017", ""),
+        ("ISO 14253-1:2017", "iso-2017", ""),
+        ("ISO 14253-1", "iso-2013", ""),
+        ("ISO 14253-1, guard band as agreed", "iso-2013", "; ISO 14253-1, guard band as agreed"),
+        ("house rule 1", "simple", "; house rule 1"),
+        ("simple acceptance", "simple", ""),
+        ("simple acceptance", "iso-2017", None),
+        ("ISO 14253-1:2013", "iso-2017", None),
+        ("ASME B89.7.3.1", "iso-2013", None),
+        ("ISO 14253-1:2017", "simple", None),
+    ],
+)
+def test_a_stated_rule_is_that_of_the_evaluation(stated, used, printed):
+    about = AdministrativeData(
+        conformity=Conformity(verdict="pass", specification="maker's limits", decision_rule=stated)
+    )
+    if printed is None:
+        parts = "conformity.decision_rule", f"'{stated}'", aj.acceptance.RULES[used], "--rule"
+        assert_refused(lambda: check_conformity(about, simulated=False, decision="conforms", rules=[used]), *parts)
+    else:
+        check_conformity(about, simulated=False, decision="conforms", rules=[used, used])
+        assert about.conformity.decided_by([used, used]) == aj.acceptance.RULES[used] + printed
 
 
 @given(st.floats(-1e4, 1e4), st.floats(1e-9, 1e3))

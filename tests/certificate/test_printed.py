@@ -116,7 +116,9 @@ def test_what_a_laboratory_states_is_printed(certificates):
     """Identification, conditions, tests with limit and decision; German with its decimal sign."""
     page = printed_certificate(certificates["all stated"], language="de").html()
     texts = Texts(page).texts
-    stated = ("X'1", "0007", "c <7>", "worn & dry", "2025-9", "K 17", "house rule 1", "2026-02-04")
+    rule = "ISO 14253-1:2017, Konformität mit einer Wahrscheinlichkeit von 95\u00a0% nachgewiesen"
+    decided = f"{rule}; passes where |E| + U is below 0.05 mm", "Deltam\u00a05,0\u00a0mm; E_Uni\u00a00,05\u00a0mm"
+    stated = ("X'1", "0007", "c <7>", "worn & dry", "2025-9", "K 17", "house rule 1", "2026-02-04", *decided)
     for text in ("Längenlabor <b>&amp; Söhne</b>", *stated):
         assert text in texts, text
     assert "20,25\u00a0°C\u00a0(u\u00a0=\u00a00,1\u00a0°C)" in texts
