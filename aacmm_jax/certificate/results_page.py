@@ -206,7 +206,7 @@ def _parameters(stage: dict[str, Element], title: str, words: Language) -> Itera
         rows.append([words("probe"), *tip, *[""] * (len(columns) - 3)])
     described = content(stage.get("Denavit-Hartenberg parameters"), "dcc:description")
     convention = re.search(r"Standard convention; the transform of a joint is ([^.]*)\.", described)
-    sentences = []
+    notes = []
     if convention and factors:  # said once
         stated = dict.fromkeys(f"{factor:g}" for factor in (min(factors), max(factors)))
         sentences = [
@@ -214,7 +214,8 @@ def _parameters(stage: dict[str, Element], title: str, words: Language) -> Itera
             words("parameters_sentence", factors=words.number(" – ".join(stated))),
             *more(len(quantities) - len(shown), words),
         ]
-    yield Section(title, headings=[words("joint"), *columns], table=rows if shown else [], notes=[" ".join(sentences)] if sentences else [])
+        notes = [" ".join(sentences)]
+    yield Section(title, headings=[words("joint"), *columns], table=rows if shown else [], notes=notes)
 
 
 def _tests(

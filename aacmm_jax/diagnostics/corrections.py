@@ -35,6 +35,7 @@ _TURN = 2 * np.pi * 1.02  # rad; readings of few joints go further
 _ROUNDS, _ROUNDS_FREE = 4, 12  # Gauss-Newton steps of the geometry, and with a zero that is far off
 _ADJUSTED = 2.0  # the factor by which a zero that was adjusted must be better than another correction
 _STARTS = 8  # zeros that are tried over a full turn
+_MOST_ELSEWHERE = 0.25  # of all poses that may be under the name of another socket
 _LATE = 3  # most rows by which readings are late or early
 UNITS = {
     "measured values are in m, but were read as mm": M,
@@ -83,9 +84,11 @@ def likely_cause(arm: Arm, capture: Capture, bounded: Sequence[str] = ()) -> Mis
         if given < _NOMINAL * size:
             return None
         tried = []
-        for correction in (*_corrections(arm, observed), *_late(arm, chosen), *_zeros(arm, observed)):
+        moved = _elsewhere(arm, [part for part in chosen if isinstance(part, Socket)], chosen)
+        for correction in (*moved, *_corrections(arm, observed), *_late(arm, chosen), *_zeros(arm, observed)):
             rms, zero = _with_zero(arm, correction) if correction.zero else (_rms(arm, correction.observed), 0.0)
-            tried.append((rms, correction._replace(cause=correction.cause.format(zero / DEG))))
+            cause = correction.cause.format(zero / DEG) if correction.zero else correction.cause
+            tried.append((rms, correction._replace(cause=cause)))
     least = min(rms for rms, _ in tried)
     if not least < min(given / _BETTER, _SMALL * size):
         return None
@@ -168,8 +171,34 @@ def _zeros(arm: Arm, observed: Observed) -> Iterator[_Correction]:
             yield _Correction(cause, same, concerns=(f"joint {joint}",), zero=f"theta_{joint}")
 
 
+def _elsewhere(
+    arm: Arm, sockets: Sequence[Socket], observations: Sequence[AbstractObservation]
+) -> Iterator[_Correction]:
+    """Poses under the name of another socket: a few whose nominal tips are nearer the median tip of that one."""
+    tips = [np.asarray(arm.position(socket.q)) for socket in sockets]
+    medians = np.array([np.median(points, axis=0) for points in tips]).reshape(-1, 3)
+    nearest = [np.linalg.norm(points[:, None] - medians, axis=2).argmin(axis=1) for points in tips]
+    poses: dict[tuple[int, int], list[str]] = {}
+    for i, places in enumerate(nearest):
+        for pose in np.flatnonzero(places != i):
+            poses.setdefault((i, int(places[pose])), []).append(f"{sockets[i].name} pose {pose + 1}")
+    count = sum(map(len, poses.values()))
+    if not 0 < count <= _MOST_ELSEWHERE * sum(map(len, tips)):
+        return
+    q, to = np.concatenate([socket.q for socket in sockets]), np.concatenate(nearest)
+    renamed = [Socket(socket.name, q[to == i]) for i, socket in enumerate(sockets) if np.sum(to == i) > 1]
+    observed = Observed.of(_thinned([*renamed, *(part for part in observations if not isinstance(part, Socket))]), None)
+    fits = shorten([f"{sockets[place].name} fits {shorten(names, 3)}" for (_, place), names in poses.items()], 3)
+    cause = f"{pluralise(count, 'pose')} recorded under the name of another socket ({fits})"
+    concerns = tuple(dict.fromkeys(sockets[i].name for pair in poses for i in pair))
+    yield _Correction(cause, observed.moved(arm, np.asarray(observed.q)), concerns=concerns, of_readings=False)
+
+
 def _late(arm: Arm, observations: Sequence[AbstractObservation]) -> Iterator[_Correction]:
-    """Readings that are some rows late or early in each file, against what was measured."""
+    """Readings that are some rows late or early in each file, against what was measured; not of sockets alone, whose
+    poses have no order but at their ends (`_elsewhere`)."""
+    if all(isinstance(observation, Socket) for observation in observations):
+        return
     count = min(observation.q.shape[0] for observation in observations)
     for rows in (by for size in range(1, _LATE + 1) for by in (size, -size)):
         if count <= 2 * _LATE:

@@ -78,8 +78,10 @@ class _Search:
         return self.fit.distances(observation.changed(q=q))
 
     def _late(self, wrong: list[int]) -> list[Misplaced]:
-        """All readings some rows late or early, also over the borders of sockets and files."""
-        if len(wrong) < 2:  # a single one is as well explained otherwise
+        """All readings some rows late or early, also over the borders of sockets and files; not where all wrong poses
+        of one place fit one other: then its name is the simpler mistake."""
+        grouped = list(self._by_place(wrong).values())
+        if len(wrong) < 2 or [len(poses) for poses in grouped] == [len(wrong)]:
             return []
         for rows in (by for size in range(1, _ROWS + 1) for by in (size, -size)):
             # Both the reading that such a pose should have, and the pose that should have its reading.

@@ -31,6 +31,7 @@ from .urdf_robots import read_urdf
 
 _SHIPPED = Path(__file__).with_name("shipped_arms")
 _OTHER_FORMATS = (*ROBOT_FILES, ".yaml", ".yml", ".conf")
+_MODEL = re.compile(r"[a-z]+\d+[a-z]{0,2}")  # ur5, iiwa7: a robot of its own, not a misspelt name
 _SMALLEST, _LARGEST = 5.0, 50_000.0  # mm: no arm's tip is always as near its base, or ever as far
 _FAR = 10_000.0  # mm: no link is as long, but frames on nearly parallel axes may be as far away
 
@@ -147,6 +148,11 @@ def usual_noise(
     return None if model is None or model.noise is None else load_noise(source, base=base, tip=tip)
 
 
+def _plain(name: str) -> str:
+    """The name of an arm without capitals, hyphens, underscores and blanks."""
+    return re.sub(r"[-_ ]", "", name.lower())
+
+
 def _path_of(source: str | os.PathLike) -> Path:
     """The file that is meant: a shipped arm's, or the one at a path."""
     shipped = isinstance(source, str) and source in shipped_arms()
@@ -194,9 +200,16 @@ def read_arm(
                 f"'{source}' does not ship with the package, and so100 has other zeros; give the URDF of the "
                 "SO-101 (arm = 'so101.urdf', tip = 'gripper_frame_link')."
             )
+        asked = _plain(str(source))
+        same = [name for name in names if _plain(name) == asked]
+        if _MODEL.fullmatch(asked) and not same:
+            raise InputError(
+                f"'{source}' does not ship with the package, and a robot of a similar name has other dimensions; give "
+                f"the URDF of this robot (arm = '{source}.urdf'), or an arm file."
+            )
         raise InputError(
             f"'{source}' is neither a file nor an arm that ships with the package"
-            f"{nearest(str(source), names, most=len(names))}"
+            f"{nearest(asked, same or names, most=len(names))}"
         )
     model = read_toml(path, ArmFile)
     if probe is not None and any(model.probe):

@@ -70,7 +70,10 @@ def with_corrections(
         by_name = {name: term_of(name, plain.joints, loads) for name in checked(model, Iterable[str], "model")}
         for name, term in by_name.items():
             if term is None:
-                raise InputError(f"'{name}' is not the name of a coefficient; give a name such as cos1_2, or a model.")
+                raise InputError(
+                    f"'{name}' is not the name of a coefficient; give a name such as cos1_2, or a model, or import the "
+                    "module that adds this kind of correction."
+                )
             if term.takes_masses and term.kind.rows == 3 and loads is None:
                 raise InputError(
                     f"'{name}' needs the masses of the links; give mass and centre, or name one of a link."

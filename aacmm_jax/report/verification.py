@@ -6,6 +6,7 @@ from ..data.capture import Capture
 from ..pipeline.verification import Verification
 from ..plot.residuals import arms_chart
 from ..summaries.verification import VERDICT_MARKS, accuracy_table, counted, meaning
+from ..uncertainty.coverage import LEVEL_IN_PERCENT
 from .elements import DRAWN, Report, Section
 
 
@@ -17,7 +18,11 @@ def verification_report(checked: Verification, capture: Capture, summary: dict[s
         del arms["nominal"], shown["nominal"]
     picture = arms_chart(capture, shown, DRAWN)
     errors = [
-        (f"RMS error, {name}", f"{found.rms:.3g} mm", f"95 %: {found.lower:.3g} to {found.upper:.3g} mm; tip fitted")
+        (
+            f"RMS error, {name}",
+            f"{found.rms:.3g} mm",
+            f"{LEVEL_IN_PERCENT}: {found.lower:.3g} to {found.upper:.3g} mm; tip fitted",
+        )
         for name, found in reversed(arms.items())
     ]
     volume = ("Expected over the working volume", f"{checked.volume:.2g} mm", "RMS, as delivered")

@@ -81,6 +81,9 @@ def _kind(annotation: object) -> str:
     if several and len(named) == 1 and not named[0].startswith("`"):
         return "tables" if named == ["table"] else f"list of {named[0]}s"
     also = [kind for kind, start in (("list", "list["), ("table", "dict[")) if start in text and not several]
+    inner = [str(part) for part in typing.get_args(annotation) if part is not type(None)]
+    if also and all(re.match(r"(typing\.Annotated\[)?(list|dict)\[", part) for part in inner):
+        return f"{' or '.join(also)} of {' or '.join(f'{word}s' for word in named)}"
     return several + (" or ".join(named) or "date") + (f", or a {' or '.join(also)} of these" if also else "")
 
 

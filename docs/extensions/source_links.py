@@ -3,10 +3,6 @@
 import importlib
 from functools import reduce
 
-from docutils import nodes
-from sphinx import addnodes
-from sphinx.util.docutils import SphinxRole
-
 
 def function_of(target: str) -> object:
     """What a target names, such as ``model/robust:Loss.along``; raises `ImportError` or `AttributeError` without it."""
@@ -14,21 +10,21 @@ def function_of(target: str) -> object:
     return reduce(getattr, name.split("."), importlib.import_module(f"aacmm_jax.{module.replace('/', '.')}"))
 
 
-class SourceRole(SphinxRole):
+def source(name: str, raw: str, text: str, line: int, inliner, options=None, content=()):
     """A link to a file of the package, beside the site; a name that does not exist is a warning."""
+    from docutils import nodes
+    from sphinx import addnodes
 
-    def run(self) -> tuple[list[nodes.Node], list[nodes.system_message]]:
-        """The link, or what is wrong with the name."""
-        try:
-            function_of(self.text)
-        except (ImportError, AttributeError, ValueError) as error:
-            return [], [self.inliner.reporter.error(f"{self.text} names nothing: {error}", line=self.lineno)]
-        module, name = self.text.split(":")
-        target = {"refdoc": self.env.docname, "reftarget": f"/../aacmm_jax/{module}.py"}
-        return [addnodes.download_reference("", "", nodes.literal("", name), **target)], []
+    try:
+        function_of(text)
+    except (ImportError, AttributeError, ValueError) as error:
+        return [], [inliner.reporter.error(f"{text} names nothing: {error}", line=line)]
+    module, function = text.split(":")
+    target = {"refdoc": inliner.document.settings.env.docname, "reftarget": f"/../aacmm_jax/{module}.py"}
+    return [addnodes.download_reference("", "", nodes.literal("", function), **target)], []
 
 
 def setup(app) -> dict[str, object]:
     """Called by Sphinx."""
-    app.add_role("source", SourceRole())
+    app.add_role("source", source)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

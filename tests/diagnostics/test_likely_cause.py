@@ -46,6 +46,14 @@ def test_readings_of_sockets(paper_arm, noisy_capture, mistake, cause):
     check(likely_cause(paper_arm, capture), cause)
 
 
+def test_poses_under_the_name_of_another_socket(paper_arm, noisy_capture):
+    """Neither late rows nor braces in a name, which are no field of a message."""
+    (first, *others), (q, *rest) = zip(*noisy_capture.sockets.items(), strict=True)
+    sockets = {first: q[:-2], "{x}": np.concatenate([q[-2:], rest[0]])} | dict(zip(others[1:], rest[1:], strict=True))
+    cause = f"2 poses recorded under the name of another socket ({first} fits {{x}} pose 1, {{x}} pose 2)"
+    check(likely_cause(paper_arm, aj.Capture(sockets)), cause)
+
+
 def check(mistake, cause):
     said = "" if mistake is None else mistake.says
     assert said.partition(". Correcting")[0] == (f"Likely cause: {cause}" if cause else "")

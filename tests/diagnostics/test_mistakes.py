@@ -56,6 +56,11 @@ def mislabelled(q):
     return q | {"A": q["A"][:-1], "B": np.concatenate([q["B"], q["A"][-1:]])}
 
 
+def twice_mislabelled(q):
+    """Two at a border, which fit those of two rows further, too."""
+    return q | {"A": q["A"][:-2], "B": np.concatenate([q["A"][-2:], q["B"]])}
+
+
 def exchanged(q):
     q["A"][2], q["C"][5] = q["C"][5].copy(), q["A"][2].copy()
     return q
@@ -76,6 +81,7 @@ FIRST_POSES = ("A pose 1", "B pose 1", "C pose 1")
         (as_read, (), ""),
         (off, ("B pose 4",), "off, as if the reading of joint 3 were wrong by 1 deg"),
         (mislabelled, ("B pose 16",), "recorded under B, but A fits"),
+        (twice_mislabelled, ("B pose 1", "B pose 2"), "recorded under B, but A fits"),
         (exchanged, ("A pose 3", "C pose 6"), "the readings of A pose 3 and C pose 6 are exchanged: each fits"),
         (late, FIRST_POSES, "the readings are 1 row late: these poses fit with those of the next row"),
     ],

@@ -6,7 +6,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.files.arms import specification_toml
 from tests import published
-from tests.refusals import assert_refused
+from tests.refusals import assert_refused, refusal
 
 K = published.LENGTH_MEAN / published.LENGTH_NOMINAL
 
@@ -236,6 +236,22 @@ def test_what_is_not_an_arm_file(tmp_path):
     assert_refused(lambda: aj.load_arm("missing.toml"), "missing.toml does not exist", "check the path")
     assert_refused(lambda: aj.load_arm(tmp_path / "folder.toml"), tmp_path, "is a folder", "give a file")
     assert_refused(lambda: aj.load_arm(tmp_path / "binary.toml"), tmp_path, "not UTF-8 text")
+
+
+@pytest.mark.parametrize("model", ["ur5", "UR16e", "iiwa7", "irb_1200"])
+def test_a_robot_that_does_not_ship_is_not_a_misspelt_name(model):
+    said = refusal(lambda: aj.load_arm(model))
+    assert f"'{model}' does not ship" in said
+    assert f"'{model}.urdf'" in said
+    assert "did you mean" not in said
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [("UR-5e", "ur5e"), ("gen3lite", "gen3-lite"), ("cheng2018-simulaton", "cheng2018-simulation")],
+)
+def test_another_writing_of_a_shipped_arm(name, meant):
+    assert_refused(lambda: aj.load_arm(name), f"'{name}'", f"did you mean '{meant}'?")
 
 
 def test_a_batch_of_arms_has_no_file(tmp_path):

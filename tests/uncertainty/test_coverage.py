@@ -18,7 +18,6 @@ PACKAGE = Path(__file__).resolve().parents[2] / "aacmm_jax"
 # has been written in its one place, such a literal elsewhere would still be what this table says.
 OTHERS = {
     "acceptance/judgement.py": 4,  # the probability of conformity of ISO 14253-1:2017
-    "cli/plan_commands.py": 1,  # part of the reach
     "cli/result_commands.py": 1,  # ISO 14253-1:2017
     "drift/statistics.py": 3,  # power of the test of a change
     "study/finding.py": 1,  # percentile of a study
@@ -27,7 +26,8 @@ OTHERS = {
     "diagnostics/corrections.py": 1,  # least improvement by another reading of a file
     "drift/results.py": 1,  # a number that rounds to 1
     "model/robust.py": 4,  # the efficiency of a loss, and a point of chi-square
-    "planning/problem.py": 2,  # part of the reach
+    "planning/problem.py": 1,  # part of the reach
+    "planning/usual.py": 1,  # the same
     "plot/study.py": 2,  # percentiles of trials
     "study/tables.py": 1,  # the same
     "summaries/calibration.py": 1,  # a correlation
