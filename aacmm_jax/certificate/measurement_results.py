@@ -20,8 +20,6 @@ from ..data.observations.pixels import Pixels
 from ..diagnostics.joint_travel import tried_poses
 from ..diagnostics.pose_residuals import ObservationResiduals, distances_of, observation_residuals, rms
 from ..files.administrative_data import NOT_STATED, AdministrativeData, Reference
-from ..kinematics.arm import parameter_names, parameter_unit
-from ..kinematics.parameters import Parameters
 from ..pipeline.hold_out import residuals_of
 from ..summaries.calibration import metrics_by_socket_and_length, prior_rows, prior_sentence
 from ..summaries.observations import distances_row, less_weight
@@ -29,7 +27,8 @@ from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.coverage import LEVEL, LEVEL_IN_PERCENT
 from ..uncertainty.volume import volumetric_uncertainty
 from . import xml_elements as xml
-from .xml_elements import MILLIMETRE, ONE, RADIAN, element, english, named, real, text
+from .parameter_results import covariance_result, in_d_si, is_known, parameters_result
+from .xml_elements import MILLIMETRE, ONE, RADIAN, element, english, named, real, result, text
 
 _METHODS = {
     "two-stage": "first from the repeatability in the sockets, and then the scale from the reference lengths",
@@ -44,15 +43,6 @@ _FIXED_SCALE = (
     "This length fixed the scale, so the arm measures its calibrated value by construction; no error was measured."
 )
 _DECIMALS = {MILLIMETRE: 5, ONE: 3, RADIAN: 8}  # of what has no uncertainty
-_SIMPLE, _SQUARED = (MILLIMETRE, RADIAN), r"\tothe{2}"  # units that are squared as one
-_D_SI = {
-    "mm": MILLIMETRE,
-    "rad": RADIAN,
-    "m": r"\metre",
-    "kN": r"\kilo\newton",
-    "K": r"\kelvin",
-    "px": ONE,
-}  # D-SI has no pixel
 _STATISTICS = {"median": "median", "95": "95th percentile", "largest": "largest"}
 _OVER_VOLUME = {"Tip position": "expanded_tip", "Measured length": "expanded_length_reading"}
 _HELD_OUT = {
@@ -201,7 +191,7 @@ def _equipment(
             count = len(quantity.values)
             labels = [""] if count == 1 else [f", {axis}" for axis in ("xyz" if count == 3 else range(1, count + 1))]
             for label, value in zip(labels, quantity.values, strict=True):
-                unit = _in_d_si(quantity.unit)
+                unit = in_d_si(quantity.unit)
                 numbers.append(xml.equipment_quantity(quantity.says + label, float(value), unit, quantity.u))
         yield element(
             "measuringEquipment",
@@ -231,7 +221,7 @@ def _results(
             named("quantity", name, real(value, MILLIMETRE, decimals=_DECIMALS[MILLIMETRE]), says=_METRICS[name][1])
             for name, value in values.items()
         )
-        yield _result("Repeatability", "Computed over all sockets with more than one pose.", quantities)
+        yield result("Repeatability", "Computed over all sockets with more than one pose.", quantities)
     if calibrated:
         yield _held_out(record, held_out_by)
     if record.recording.capture.lengths:
@@ -242,15 +232,15 @@ def _results(
             _observation(number, part, of_arm, calibrated)
             for number, (part, of_arm) in enumerate(zip(residuals, distances, strict=True), start=1)
         )
-        yield _result("Observations", "Distances of the tip from the geometry of each observation.", rows)
-    yield _parameters(record, stage, uncertainty)
+        yield result("Observations", "Distances of the tip from the geometry of each observation.", rows)
+    yield parameters_result(record, stage, uncertainty)
     if calibrated:
         yield _volume(record, uncertainty)
-        yield _covariance(record)
+        yield covariance_result(record)
     if calibrated and not math.isnan(record.k):
-        u = record.u_k if _is_known(record.u_k) else None
+        u = record.u_k if is_known(record.u_k) else None
         k = real(record.k, ONE, u, None if u is None else uncertainty.expanded_k(LEVEL) / u)
-        yield _result(
+        yield result(
             "Scale",
             "Reference lengths as measured by the arm before its scale was set, divided by their calibrated values.",
             named("quantity", "k", k),
@@ -272,7 +262,7 @@ def _held_out(record: CalibrationRecord, evaluation: EvaluationRecord | None) ->
         for name, value, unit in values
         if value is not None
     )
-    return _result("Held-out poses", says, quantities) if row["poses"] else None
+    return result("Held-out poses", says, quantities) if row["poses"] else None
 
 
 def _volume(record: CalibrationRecord, uncertainty: Uncertainty) -> Element | None:
@@ -284,7 +274,7 @@ def _volume(record: CalibrationRecord, uncertainty: Uncertainty) -> Element | No
         regions = {"where poses were taken": near} | regions
     for (region, volume), (name, key) in itertools.product(regions.items(), _OVER_VOLUME.items()):
         values = {says: volume[f"{key}_{statistic}_mm"] for statistic, says in _STATISTICS.items()}
-        if all(map(_is_known, values.values())):
+        if all(map(is_known, values.values())):
             decimals = xml.decimals_of(min(values.values()))
             numbers = [named("quantity", says, real(u, MILLIMETRE, decimals=decimals)) for says, u in values.items()]
             length = named("quantity", "length", real(float(f"{everywhere.length:.6g}"), MILLIMETRE))
@@ -297,11 +287,7 @@ def _volume(record: CalibrationRecord, uncertainty: Uncertainty) -> Element | No
         covered = tried_poses(record.calibrated.arm, poses, everywhere.q).tried.mean()
         share = "Share of the random poses as near to a pose of the calibration as these are to one another"
         rows.append(named("quantity", "covered", real(covered, ONE, decimals=2), says=share))
-    return _result("Expanded uncertainty", says, *rows) if rows else None
-
-
-def _result(name: str, description: str, *data: Element | Iterator[Element]) -> Element:
-    return named("result", name, element("data", *data), says=description)
+    return result("Expanded uncertainty", says, *rows) if rows else None
 
 
 def _length_name(number: int, length: ReferenceLength) -> str:
@@ -332,7 +318,7 @@ def _lengths(record: CalibrationRecord, evaluation: Evaluation, calibrated: bool
                 named("quantity", "error", of_error, ref_type="basic_measurementError"),
             ]
         rows.append(element("list", text("name", _length_name(number, length)), construction, quantities))
-    return _result(
+    return result(
         "Reference lengths",
         "An error is the measured value minus the calibrated one; the uncertainty of the error includes the "
         "uncertainty of the calibrated value and the scatter of the poses at both ends. Where thermal expansion is "
@@ -346,7 +332,7 @@ def _observation(number: int, part: ObservationResiduals, distances: np.ndarray,
     values = [("RMS residual", rms(part.distance if calibrated else distances), MILLIMETRE)]
     if calibrated:
         values.append(("RMS residual in standard deviations", rms(part.normalised), ONE))
-        values += [(f"RMS residual in {unit}", rms(sizes), _in_d_si(unit)) for unit, sizes in part.other.items()]
+        values += [(f"RMS residual in {unit}", rms(sizes), in_d_si(unit)) for unit, sizes in part.other.items()]
     target = f", tip: {part.observation.target}" if part.observation.target else ""
     return element(
         "list",
@@ -358,72 +344,3 @@ def _observation(number: int, part: ObservationResiduals, distances: np.ndarray,
             if math.isfinite(value)
         ),
     )
-
-
-def _parameters(record: CalibrationRecord, stage: str, uncertainty: Uncertainty) -> Element:
-    factors = dict(zip(record.names, map(float, uncertainty.factor(LEVEL)), strict=True))
-    recording, calibrated = record.recording, stage == "calibrated"
-    specification = record.calibrated if calibrated else recording.nominal
-    arm = (recording.as_found if stage == "as_found" and recording.as_found is not None else specification).arm
-    names, quantities = parameter_names(arm), []
-    for name, value in zip(names, np.asarray(Parameters(arm, names).vector()).tolist(), strict=True):
-        note, u = _note_and_uncertainty(record, name) if calibrated else ("", None)
-        measured = real(value, _in_d_si(parameter_unit(arm, name)), u, factors.get(name))
-        quantities.append(named("quantity", name, measured, says=note))
-    corrections = (
-        " Each joint correction adds its coefficient times a known function of the readings to theta (to d for a "
-        "prismatic joint). The gravity components give the direction of gravity in the base frame."
-    )
-    return _result(
-        "Denavit-Hartenberg parameters",
-        "Standard convention; the transform of a joint is Rz(q + theta) Tz(d) Tx(a) Rx(alpha) Ry(beta). The probe is "
-        "the tip in the last frame." + ("" if arm.corrections is None else corrections),
-        *quantities,
-    )
-
-
-def _in_d_si(unit: str) -> str:
-    """A unit such as "rad/(kN m)" in D-SI, with factors below the stroke as negative powers."""
-    above, _, below = unit.partition("/")
-    factors = [] if above == "1" else [_D_SI[above]]
-    return "".join([*factors, *(_D_SI[factor] + r"\tothe{-1}" for factor in below.strip("()").split())]) or ONE
-
-
-def _covariance(record: CalibrationRecord) -> Element | None:
-    """The covariance matrix of the parameters that have an uncertainty of their own, a row each."""
-    index = [i for i, name in enumerate(record.names) if _note_and_uncertainty(record, name)[1] is not None]
-    if not index:
-        return None
-    units = [_in_d_si(parameter_unit(record.calibrated.arm, record.names[i])) for i in index]
-    covariance = np.asarray(record.covariance)[np.ix_(index, index)]
-    rows = []
-    for i, values, unit in zip(index, covariance.tolist(), units, strict=True):
-        products = [f"{unit}{_SQUARED}" if unit == other and unit in _SIMPLE else unit + other for other in units]
-        numbers = xml.si("valueXMLList", " ".join(f"{value:.8g}" for value in values))
-        row = xml.si("realListXMLList", numbers, xml.si("unitXMLList", " ".join(products)))
-        rows.append(element("quantity", text("name", record.names[i]), row))
-    return _result(
-        "Covariance matrix",
-        "Covariances of the parameters that have an uncertainty of their own: one row per parameter, columns in the "
-        "same order. The diagonal contains the squares of the standard uncertainties. Expanded uncertainties elsewhere "
-        "in the certificate are rounded; use this matrix for quantities that depend on several parameters.",
-        named("list", "Covariance", rows),
-    )
-
-
-def _note_and_uncertainty(record: CalibrationRecord, name: str) -> tuple[str, float | None]:
-    """A note on a calibrated parameter, and its standard uncertainty if it has one of its own."""
-    if name not in record.names:
-        return "Not identified: fixed at its nominal value", None
-    i = record.names.index(name)
-    u = float(np.sqrt(record.covariance[i, i]))
-    if record.active[i]:
-        bound = f"On its {'lower' if record.active[i] < 0 else 'upper'} bound"
-        return f"{bound}, so it has no uncertainty of its own", None
-    if not (record.determined[i] and _is_known(u)):
-        return "Determined only together with other parameters, so it has no uncertainty of its own", None
-    return "", u
-
-
-def _is_known(u: float) -> bool:
-    return math.isfinite(u) and u > 0

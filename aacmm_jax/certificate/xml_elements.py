@@ -76,6 +76,11 @@ def named(tag: str, name: str, *children: Child, says: str = "", ref_type: str |
     return element(tag, english("name", name), described, *children, ref_type=ref_type)
 
 
+def result(name: str, description: str, *data: Element | Iterable[Element]) -> Element:
+    """A measurement result with its data."""
+    return named("result", name, element("data", *data), says=description)
+
+
 def method(name: str, says: str, norm: str | None = None, *, of_uncertainty: bool = False) -> Element:
     """A method that was used, with the document that describes it."""
     ref_type = "basic_methodMeasurementUncertainty" if of_uncertainty else None

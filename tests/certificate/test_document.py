@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import aacmm_jax as aj
 from aacmm_jax.calibration.record import Removed
-from aacmm_jax.certificate import dcc_xml, measurement_results, parse_dcc, xml_elements
+from aacmm_jax.certificate import dcc_xml, measurement_results, parameter_results, parse_dcc, xml_elements
 from aacmm_jax.diagnostics.findings import findings_of, sentences
 from aacmm_jax.files.administrative_data import (
     AdministrativeData,
@@ -762,7 +762,7 @@ def test_every_unit_of_a_correction_has_its_name_in_d_si(kind):
     loads = Loads((1.0,) * 3, ((0.0, 0.0, 0.0),) * 3)
     units = {term.unit for with_masses in (None, loads) for term in kind.terms(3, "", with_masses)}
     for unit in units | {unit.replace("rad", "mm") for unit in units}:
-        assert measurement_results._in_d_si(unit).startswith("\\")
+        assert parameter_results.in_d_si(unit).startswith("\\")
 
 
 @pytest.mark.parametrize(
@@ -775,4 +775,4 @@ def test_every_unit_of_a_correction_has_its_name_in_d_si(kind):
     ],
 )
 def test_units_in_d_si(unit, expected):
-    assert measurement_results._in_d_si(unit) == expected
+    assert parameter_results.in_d_si(unit) == expected

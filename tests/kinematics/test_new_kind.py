@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.certificate.measurement_results import _in_d_si
+from aacmm_jax.certificate.parameter_results import in_d_si
 from aacmm_jax.cli import views
 from aacmm_jax.cli.display import display
 from aacmm_jax.diagnostics.model_errors import model_tests
@@ -121,7 +121,7 @@ def test_its_prior_is_stated_in_words(nominal):
 
 
 def test_certificates_have_its_unit():
-    assert _in_d_si("1/rad") == r"\radian\tothe{-1}"
+    assert in_d_si("1/rad") == r"\radian\tothe{-1}"
 
 
 @pytest.mark.slow
