@@ -39,8 +39,9 @@ def test_urdf_to_calibrated_urdf(aacmm, tmp_path, robot):
     np.testing.assert_allclose(program["position"](Q[0]), record.calibrated.arm.position(Q[0]), rtol=0, atol=1e-9)
     aacmm("export", "calibration.h5", "-o", "kinematics.yaml")
     assert aj.load_arm(tmp_path / "kinematics.yaml").joints == 6
-    offsets = aacmm("export", "calibration.h5", "--format", "offsets").stdout
-    assert offsets.count("\n") == 3 + 1 + 6
+    offsets = aacmm("export", "calibration.h5", "--format", "offsets").stdout.splitlines()
+    assert sum(line.startswith("#") for line in offsets) == 4
+    assert len(offsets) == 4 + 1 + 6
     table = aacmm("export", "calibration.h5", "--format", "table", "--convention", "craig", "--units", "m-rad").stdout
     assert "joint,theta_rad,d_m,a_m,alpha_rad,beta_rad" in table
     said = aacmm("export", "calibration.h5", "--format", "csv", "--units", "m-rad", expect=2).stderr
