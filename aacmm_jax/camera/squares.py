@@ -10,7 +10,7 @@ from .evidence import BORDER, DARK, FEWEST, Grey, Refusal, fitting, inside, leve
 _SIDE = 0.4  # of the contrast of the board: a row of squares with more is there, one with less is not
 _FAINT = 0.25  # of the contrast of the board: a corner whose squares differ by less is hidden
 _SEARCHED = 1280  # px: the larger side of an image in which a checkerboard is searched
-_ROOM = 0.9  # half the window, of the distance to the nearest marker
+_HALF_WINDOW = 0.9  # of the distance to the nearest marker
 _MOST_MOVED = 1.5  # px: a corner that is farther from where markers have it is another edge
 _WINDOWS = (2, 11)  # px: half the window in which a corner is refined
 
@@ -104,8 +104,8 @@ def charuco_corners(
         return projected(matrix, points + np.array([x, y])) - projected(matrix, points)
 
     free = (board.size - board.marker) / 2  # of markers, around a corner
-    room = np.minimum(np.linalg.norm(moved(free, 0), axis=1), np.linalg.norm(moved(0, free), axis=1))
-    corners = _refined(grey, start, _ROOM * room)
+    distance = np.minimum(np.linalg.norm(moved(free, 0), axis=1), np.linalg.norm(moved(0, free), axis=1))
+    corners = _refined(grey, start, _HALF_WINDOW * distance)
     # Two black and two white squares, as the board has them; elsewhere the corner is hidden.
     beside = {
         (x, y): levels_at(grey, corners + moved(0.7 * x * free, 0.7 * y * free)) for x in (-1, 1) for y in (-1, 1)
@@ -116,9 +116,9 @@ def charuco_corners(
     black, white = np.where(black_first, falling, rising), np.where(black_first, rising, falling)
     contrast = white.min(axis=0) - black.max(axis=0)
     kept = contrast > _FAINT * np.median(white - black)
-    kept &= np.linalg.norm(corners - start, axis=1) < np.maximum(0.5 * room, _MOST_MOVED)
+    kept &= np.linalg.norm(corners - start, axis=1) < np.maximum(0.5 * distance, _MOST_MOVED)
     if kept.sum() >= FEWEST["charuco"]:
-        spacing = board.size / free * float(np.median(room))
+        spacing = board.size / free * float(np.median(distance))
         kept[kept] = fitting(board, ids[kept], corners[kept], spacing, grey.shape[::-1])
     return ids[kept], corners[kept]
 

@@ -9,6 +9,7 @@ from .languages import Language
 from .xml_elements import CELSIUS, MILLIMETRE, ONE, PREFIXES, RADIAN, decimals_of, rounded
 
 MOST_ROWS = 6  # of a table: the certificate has two pages
+_LEAST = 1e-9  # mm or rad, below which a value without uncertainty is rounding
 VALUE, UNCERTAINTY = "si:real/si:value", "si:real/si:measurementUncertaintyUnivariate/"
 _UNITS = {MILLIMETRE: "mm", RADIAN: "rad", CELSIUS: "°C", ONE: ""}
 
@@ -58,8 +59,10 @@ def value_of(quantity: Element) -> str:
 
 
 def shortened(text: str) -> str:
-    """A number as the DCC has it, but of those that were given to 17 digits at most 7 decimals."""
-    return text if len(text.partition(".")[2]) <= 8 and "e" not in text.lower() else f"{float(text):.7g}"
+    """A number as the DCC has it, but of those that were given to 17 digits at most 7, and none below 1e-9."""
+    if len(text.partition(".")[2]) <= 8 and "e" not in text.lower():
+        return text
+    return f"{float(text):.7g}" if abs(float(text)) >= _LEAST else "0.0"
 
 
 def expanded_of(quantity: Element) -> tuple[str, str]:

@@ -38,10 +38,8 @@ def other_tip(record: Any, chain: Any, meant: np.ndarray) -> list[str]:
     targets = {name: at for name, at in targets if not np.allclose(at, meant, rtol=0, atol=1e-3)}
     if not targets:
         return []
-    of, first = (
-        ", ".join(f"{printable(name)} ({_mm(at)})" for name, at in targets.items()),
-        printable(next(iter(targets))),
-    )
+    of = ", ".join(f"{printable(name)} ({_mm(at)})" for name, at in targets.items())
+    first = printable(next(iter(targets)))
     return [
         f"The positions are those of the arm's tip, ({_mm(meant)}) mm in the last frame, not those of the measured "
         f"target, which the calibration found elsewhere in this frame [mm]: {of}. If the target is to reach the "

@@ -218,9 +218,12 @@ def _signs_of(record: Any, zeros: Any, motors: str | None) -> list[str]:
     """How the signs with which the joints were recorded take part in a controller's file, where they matter."""
     recorded = zeros.read_as
     if recorded is None:
-        unknown = "sign" in record.recording.stated and motors is None
-        return ["Warning: the calibration does not store the signs stated in [angles]; state them with --motors (a "
-                "minus before each joint that was recorded with sign = -1)."] * unknown  # fmt: skip
+        if "sign" not in record.recording.stated or motors is not None:
+            return []
+        return [
+            "Warning: the calibration does not store the signs stated in [angles]; state them with --motors (a minus "
+            "before each joint that was recorded with sign = -1)."
+        ]
     against = ", ".join(str(i) for i, number in enumerate(recorded, start=1) if number < 0)
     if motors is None:
         return [f"Signs as recorded: joint {against} counts against its motor."] if against else []

@@ -111,5 +111,5 @@ def pluralise(number: int, noun: str) -> str:
 
 
 def f_text(ratio: float) -> str:
-    """An F statistic as sentences and tables have it: the size of one beyond every critical value says nothing."""
+    """An F statistic in sentences and tables; beyond every critical value, only that it is."""
     return f"= {ratio:.3g}" if ratio < _LARGE_F else f"> {_LARGE_F}"

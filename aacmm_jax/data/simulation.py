@@ -258,7 +258,7 @@ class _Recorder(NamedTuple):
             found += list(q[np.all((box[0] <= origins) & (origins <= box[1]), axis=1)])
             if len(found) >= len(labels):
                 return np.array(found[: len(labels)])
-        raise InputError(f"{labels[0]} has a link that is hardly ever in its region; give a region where the link is.")
+        raise InputError(f"{labels[0]} has a link that is almost never in its region; give a region where the link is.")
 
 
 def _chain_numbers(

@@ -37,7 +37,7 @@ def test(case: Case) -> list[Finding]:
 
 
 def _standing(record: CalibrationRecord) -> list[Finding]:
-    """Joints that hardly moved, where that leaves free parameters undetermined for which there is no prior."""
+    """Joints that moved too little, where that leaves free parameters undetermined for which there is no prior."""
     nominal = record.recording.nominal
     rows = [] if record.prior is not None else standing_rows(nominal.arm, record.recording.capture)
     rows = [row for row in rows if not set(row["lost"]).isdisjoint(record.names)]
@@ -48,10 +48,10 @@ def _standing(record: CalibrationRecord) -> list[Finding]:
     return [
         Finding(
             "standing-joints",
-            f"{joints.capitalize()} hardly moved in these poses, so that {shorten(lost, 6)} cannot be identified.",
+            f"{joints.capitalize()} moved too little in these poses, so that {shorten(lost, 6)} cannot be identified.",
             advice="Let every joint move over most of its travel, or hold these parameters (--held).",
             severity="doubt" if record.converged else "unusable",
-            doubt=f"{joints} hardly moved",
+            doubt=f"{joints} moved too little",
             concerns=tuple(f"joint {row['joint']}" for row in rows),
         )
     ]

@@ -203,9 +203,8 @@ def calibration_summary(record: CalibrationRecord, volume: VolumetricUncertainty
             bound=[sides.get(int(side)) for side in record.active],
         ),
         "uncertainty": _uncertainty_summary(record, volume),
-        "cross_validation": None
-        if record.validation is None
-        else cross_validation_summary(record.validation, bool(record.recording.capture.sizes)),
+        "cross_validation": record.validation
+        and cross_validation_summary(record.validation, bool(record.recording.capture.sizes)),
         "model_tests": rows_of_tests(model_tests(record)) if fits else None,
         "prior": None if record.prior is None else prior_rows(record.prior),
         "shared_errors": None if record.shared is None else shared_rows(record.shared),

@@ -132,7 +132,7 @@ SIDES = [[60, 0, 10], [0, 80, 0]]
 REFUSED = {
     "name two chains": lambda: kinds.SimulatedPlaneContact("plate", BOX, (0, 0, 0), SIDES, 3, "left", "left"),
     "link 7 does not exist; give .* 1 to 6": lambda: aj.simulate(TWO, {}, observations=[INNER.changed(link=7)]),
-    "hardly ever in its region": lambda: aj.simulate(TWO, {}, observations=[FAR]),
+    "almost never in its region": lambda: aj.simulate(TWO, {}, observations=[FAR]),
     "give the number of a chain, 0 to 1": lambda: TWO.position([[*np.zeros(TWO.joints), 3.0]]),
 }
 

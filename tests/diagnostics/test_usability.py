@@ -119,6 +119,6 @@ def test_joints_that_stand_still_are_named_first(paper_arm, moved, says):
     recording = aj.Recording(capture, aj.files.load_specification("cheng2018-simulation", capture=capture))
     record = aj.calibrate_capture(recording, model="dh", automatic=False, cross_validate=False, shared_errors=False)
     first = findings_of(record)[:1]
-    assert [finding.doubt for finding in first if finding.code == "standing-joints"] == [f"{says} hardly moved"] * bool(
-        says
-    )
+    assert [finding.doubt for finding in first if finding.code == "standing-joints"] == [
+        f"{says} moved too little"
+    ] * bool(says)
