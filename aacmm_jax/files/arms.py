@@ -202,7 +202,8 @@ def read_arm(
             )
         asked = _plain(str(source))
         same = [name for name in names if _plain(name) == asked]
-        if _MODEL.fullmatch(asked) and not same:
+        shortened = any(name.partition("-")[0] == asked for name in names)
+        if _MODEL.fullmatch(asked) and not same and not shortened:
             raise InputError(
                 f"'{source}' does not ship with the package, and a robot of a similar name has other dimensions; give "
                 f"the URDF of this robot (arm = '{source}.urdf'), or an arm file."

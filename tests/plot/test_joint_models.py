@@ -41,7 +41,7 @@ def test_bars_of_compared_models(compared):
     inside, outside = ([bar.get_height() for bar in bars] for bars in axes.containers if len(bars) == 2 and bars[0])
     assert inside == [model.rms_inside for model in compared.models]
     assert outside == [model.rms_outside for model in compared.models]
-    assert ["recommended" in label.get_text() for label in axes.get_xticklabels()] == [False, True]
+    assert ["✓" in label.get_text() for label in axes.get_xticklabels()] == [False, True]
     axes.figure.savefig(io.BytesIO())
 
 
