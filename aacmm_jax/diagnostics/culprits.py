@@ -25,7 +25,7 @@ from .culprit_words import Culprit, Result, in_words
 from .equations import Block, Rows, wider
 from .findings import Case, by_equations
 from .hypotheses import pose_names, shifted_seats, steps
-from .missing_terms import FoundTerm, columns_of, missing_terms
+from .missing_terms import FoundTerm, columns_of
 from .possible_causes import Cause, of_certified, of_functions, of_parameters, of_variances
 from .residual_tests import LEVEL, PRESENT, SURE, Candidates, Residuals, ScoreTest, Studentised, studentised
 
@@ -72,17 +72,33 @@ def explained(case: Case) -> tuple[list[Rows], list[Block]]:
     return chosen.rows, chosen.relations
 
 
+def is_clear(case: Case, level: float) -> bool:
+    """Whether a cause other than a noisy joint is less probable than a level by chance.
+
+    In most cases the cause that explains most is, and then no others are searched for.
+    """
+    if not case.scatters:
+        return False
+    search = case.once(_search)
+    while search.first is None and search.found_next():
+        pass
+    first = search.first
+    if first is not None and first.cause.kind != "noisy joint" and first.probability < level:
+        return True
+    return any(culprit.kind != "noisy joint" and culprit.probability < level for culprit in culprits_of(case))
+
+
 @by_equations
 def selection(case: Case) -> Selection:
     """Forward selection among all causes."""
     rows, relations = case.chunks
     if not case.scatters:
         return Selection((), rows, relations, 1.0)
-    return _Search(case).run()
+    return case.once(_search).run()
 
 
 class _Search:
-    """The selection, while it is made."""
+    """The selection, cause by cause."""
 
     def __init__(self, case: Case):
         self.case, (self.rows, self.relations) = case, case.chunks
@@ -93,15 +109,18 @@ class _Search:
         self.noises = of_variances(case, self.rows)
         self.added: list[Callable[[], Float[np.ndarray, "R c"]]] = []  # columns of the causes that were chosen
         self.chosen: list[tuple[Result, list[Result]]] = []
+        self.shares: list[tuple[float, int]] = []  # of all squares, and unknowns
+        self.remaining = 1.0  # part of the squares
         self.sizes: dict[str, int] = {}  # causes of each family
         self.least = _SECOND_ORDER * float(np.sqrt(case.left.cost))
         self._begin()
+        self.freedom = self.left.degrees_of_freedom
 
     def _begin(self) -> None:
         """By the rows as they are weighted now."""
         self.left = Residuals.of([*(part.block("") for part in self.rows), *self.relations])
-        self.candidates = Candidates.of(self.left, [self._columns(cause) for cause in self.causes])
-        self.fixed = Candidates.of(self.left, [self._columns(cause) for cause in self.parameters])
+        self.candidates = Candidates.of(self.left, self._columns(self.causes))
+        self.fixed = Candidates.of(self.left, self._columns(self.parameters))
         for columns in self.added:
             self._extend(columns())
 
@@ -111,14 +130,11 @@ class _Search:
         self.candidates = self.candidates.less(self.left.basis[:, before:])
         self.fixed = self.fixed.less(self.left.basis[:, before:])
 
-    def _columns(self, cause: Cause) -> Float[np.ndarray, "R _"]:
-        of_relations = sum(len(block.residual) for block in self.relations)
-        if cause.term is not None:
-            (columns,) = columns_of([cause.term], self.rows)
-            return np.pad(columns, ((0, of_relations), (0, 0)))
-        column = np.zeros((len(self.case.left.values), 1))
-        column[len(column) - of_relations + cause.row] = 1.0
-        return column
+    def _columns(self, causes: Sequence[Cause]) -> list[Float[np.ndarray, "R _"]]:
+        count, of_relations = len(self.case.left.values), sum(len(block.residual) for block in self.relations)
+        of_terms = iter(columns_of([cause.term for cause in causes if cause.term is not None], self.rows, of_relations))
+        first = count - of_relations
+        return [next(of_terms) if cause.term else np.eye(count, 1, -first - cause.row) for cause in causes]
 
     def _at_this_scale(self) -> Candidates:
         """Fixed parameters, less what the scale anchor does: with both free, the arm could shrink, and with it its
@@ -147,26 +163,35 @@ class _Search:
             start += m * r
         raise KeyError(number)
 
+    @property
+    def first(self) -> Result | None:
+        """The first cause that is named, whatever follows; the seat never is."""
+        return next((result for result, _ in self.chosen if result.cause.kind != "tip"), None)
+
+    def found_next(self) -> bool:
+        """Whether there is a further cause, which joins the model."""
+        results = self._results() if len(self.chosen) < MOST_CAUSES + _MOST_POSES else []
+        if not results:
+            return False
+        best, *others = self._at_their_poses(sorted(results, key=lambda result: -result.criterion))
+        if best.cause.kind != "pose" and sum(r.cause.kind != "pose" for r, _ in self.chosen) >= MOST_CAUSES:
+            return False
+        alike = [other for other in others if other.criterion > best.criterion - _AS_WELL]
+        best, alike = _likelier_first(best, alike)
+        self.chosen.append((best, alike))
+        added = 1 if best.test is None else best.test.degrees_of_freedom[0]
+        self.shares.append((self.remaining * best.share, added))
+        self.remaining *= 1 - best.share
+        self._take(best)
+        return True
+
     def run(self) -> Selection:
-        remaining = 1.0
-        shares: list[tuple[float, int]] = []  # of what was left, and unknowns
-        freedom = self.left.degrees_of_freedom
-        while len(self.chosen) < MOST_CAUSES + _MOST_POSES:
-            results = self._results()
-            if not results:
-                break
-            best, *others = self._at_their_poses(sorted(results, key=lambda result: -result.criterion))
-            if best.cause.kind != "pose" and sum(r.cause.kind != "pose" for r, _ in self.chosen) >= MOST_CAUSES:
-                break
-            alike = [other for other in others if other.criterion > best.criterion - _AS_WELL]
-            best, alike = _likelier_first(best, alike)
-            self.chosen.append((best, alike))
-            added = 1 if best.test is None else best.test.degrees_of_freedom[0]
-            shares.append((remaining * best.share, added))
-            remaining *= 1 - best.share
-            self._take(best)
-        excess = [share - added * remaining / max(self.left.degrees_of_freedom, 1) for share, added in shares]
-        whole = max(1 - freedom * remaining / max(self.left.degrees_of_freedom, 1), 1e-12)
+        """All causes."""
+        while self.found_next():
+            pass
+        each = self.remaining / max(self.left.degrees_of_freedom, 1)  # of one degree of freedom
+        excess = [share - added * each for share, added in self.shares]
+        whole = max(1 - self.freedom * each, 1e-12)
         culprits = self._culprits([min(max(part / whole, 0.0), 1.0) for part in excess])
         columns = [columns() for columns in self.added]
         named = float(np.prod([1 - best.share for best, _ in self.chosen if best.cause.kind != "tip"]))
@@ -209,11 +234,16 @@ class _Search:
         if cause.kind == "pose":
             return lambda: self._of_pose(cause.row)
         if cause.kind != "fixed" or not self.anchor:
-            return lambda: self._columns(cause)
+            return lambda: self._columns([cause])[0]
         number, lengths = self.parameters.index(cause), self.fixed.lengths
         of_cause, of_anchor = self.fixed.projected[:, number], self.fixed.projected[:, -1]
         part = float(of_cause @ of_anchor) / self._of_anchor() * lengths[number] / lengths[-1]
-        return lambda: self._columns(cause) - part * self._columns(self.anchor[0])
+
+        def less_anchor() -> Float[np.ndarray, "R c"]:
+            columns, anchor = self._columns([cause, *self.anchor])
+            return columns - part * anchor
+
+        return less_anchor
 
     def _results(self) -> list[Result]:
         """All significant causes."""
@@ -258,11 +288,10 @@ class _Search:
         if best.cause.family == "seat":
             terms = shifted_seats(capture, term)
         else:
-            gravity = [t for t in missing_terms(arm, np.asarray(capture.readings)) if t.kind == "gravity"]
+            gravity = [cause.term for cause in self.causes if cause.term is not None and cause.term.kind == "gravity"]
             terms = steps(arm, capture, gravity, term)
         causes = [best.cause._replace(term=shifted) for shifted in terms]
-        near = Candidates.of(self.left, [self._columns(cause) for cause in causes])
-        tests = near.tests(self.left, self.least)
+        tests = Candidates.of(self.left, self._columns(causes)).tests(self.left, self.least)
         cause, test = max(zip(causes, tests, strict=True), key=lambda pair: pair[1].gain)
         return self._of_columns(cause, test, self.sizes[cause.family])
 
@@ -278,8 +307,10 @@ class _Search:
         count = sum(len(block.residual) for block in self.relations)
         projected, parts = self.candidates.projected, self.candidates.parts
         rows = len(projected) - count
-        squares = np.array([np.sum(projected[:, part] ** 2) for part in parts])
-        below = np.array([np.sum(projected[rows:, part] ** 2) for part in parts])
+        owner = np.repeat(np.arange(len(parts)), [part.stop - part.start for part in parts])
+        squares, below = (
+            np.bincount(owner, np.sum(columns**2, axis=0), len(parts)) for columns in (projected, projected[rows:])
+        )
         of_values = np.array([cause.kind == "certified" for cause in self.causes])
         return (below > _MOSTLY * squares) & ~of_values
 
@@ -316,11 +347,14 @@ class _Search:
             assert along is not None
             sizes, squares = [], []
             for part, pose in zip(self.rows, poses, strict=True):
-                z = pose.root @ along(part)
+                z = along(part)
+                if not np.any(z):
+                    continue
+                z = pose.root @ z
                 values, vectors = np.linalg.eigh(z @ z.swapaxes(1, 2))
                 sizes.append(values.ravel())
                 squares.append((np.einsum("mab,ma->mb", vectors, pose.values) ** 2).ravel())
-            size, square = np.concatenate(sizes), np.concatenate(squares)
+            size, square = np.concatenate([np.zeros(0), *sizes]), np.concatenate([np.zeros(0), *squares])
             size, square = size[size > 1e-9 * size.max(initial=0.0)], square[size > 1e-9 * size.max(initial=0.0)]
             if not len(size):
                 continue
@@ -362,6 +396,12 @@ class _Search:
             culprit = Culprit(cause.kind, cause.name, result.probability, part)
             culprits.append(in_words(self.case, culprit, result, alike, coefficients.get(id(result), np.zeros(0))))
         return tuple(culprits)
+
+
+@by_equations
+def _search(case: Case) -> _Search:
+    """The search, which goes on where it was left."""
+    return _Search(case)
 
 
 def _likelier_first(best: Result, alike: list[Result]) -> tuple[Result, list[Result]]:

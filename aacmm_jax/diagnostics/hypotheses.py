@@ -46,31 +46,31 @@ def steps(
     arm, q = to_numpy(arm), np.asarray(capture.readings)
     forward, (names, _, _) = forward_pass(arm.geometry, joint_motion(arm.geometry, q)), pose_names(capture)
     turned = np.stack([np.moveaxis(np.asarray(axis), 0, -1).reshape(-1, 3) for axis in forward.frame], axis=2)
-    terms = []
+    always, changes = np.ones((len(q), 1)), []  # what each would be if it were so at all poses
+    for joint in range(1, arm.joints + 1):
+        follows, cause = f"a step of the zero of joint {joint}", "a zero offset that slips"
+        changes.append(MissingTerm("slipped zero", joint, always, False, follows, cause, f"joint {joint}"))
+    base, probe = "a displacement of the base, artefact or instrument", "a displacement of the probe on the arm"
+    changes.append(MissingTerm("moved base", None, always[:, :, None] * np.eye(3), False, base, _BASE))
+    changes.append(MissingTerm("moved probe", None, turned, False, probe, _PROBE))
+    for load in gravity:
+        follows, cause = f"a change of the load on joint {load.joint}", "a payload that was put on or taken off"
+        changes.append(load._replace(kind="payload", follows=follows, cause=cause))
     places = np.unique(np.linspace(_FEWEST, len(q) - _FEWEST, _STEPS).astype(int))
     if near is not None:
         between = (_LOADS if near.kind == "payload" else 1) * (len(q) // _STEPS + 1)
         places = np.arange(near.first - between, near.first + between + 1)
+        changes = [change for change in changes if (change.kind, change.concerns) == (near.kind, near.concerns)]
+    terms = []
     for number, first in enumerate(int(place) for place in places if 0 < place < len(q)):
-        later, after = (np.arange(len(q)) >= first).astype(float)[:, None], f"from {names[first]} on"
-        for joint in range(1, arm.joints + 1):
-            follows, concerns = f"a step of the zero of joint {joint} {after}", f"joint {joint}"
-            term = MissingTerm("slipped zero", joint, later, follows=follows, concerns=concerns, first=first)
-            terms.append(term._replace(cause="a zero offset that slips"))
-        for kind, columns, follows, cause in (
-            ("moved base", np.eye(3)[None], "a displacement of the base, artefact or instrument", _BASE),
-            ("moved probe", turned, "a displacement of the probe on the arm", _PROBE),
-        ):
-            columns = later[:, :, None] * columns
-            terms.append(MissingTerm(kind, None, columns, follows=f"{follows} {after}", cause=cause, first=first))
-        for load in gravity if near is not None or number % _LOADS == 0 else ():
-            follows = f"a change of the load on joint {load.joint} {after}"
-            cause = "a payload that was put on or taken off"
-            loaded = load._replace(kind="payload", values=later * load.values, first=first)
-            terms.append(loaded._replace(follows=follows, cause=cause))
-    if near is None:
-        return terms
-    return [term for term in terms if (term.kind, term.concerns) == (near.kind, near.concerns)]
+        for change in changes:
+            if near is None and change.kind == "payload" and number % _LOADS:
+                continue
+            values = np.array(change.values)
+            values[:first] = 0.0
+            follows = f"{change.follows} from {names[first]} on"
+            terms.append(change._replace(values=values, follows=follows, first=first))
+    return terms
 
 
 def shifted_seats(capture: Capture, near: MissingTerm | None = None) -> list[MissingTerm]:

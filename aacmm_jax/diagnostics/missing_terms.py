@@ -93,18 +93,24 @@ def wider_model(terms: Sequence[FoundTerm], arm: Arm | None) -> str:
     return "" if present and wider == model_of(present) else wider
 
 
-def columns_of(terms: Sequence[MissingTerm], rows: Sequence[Rows]) -> list[Float[np.ndarray, "R _"]]:
-    """The columns of each term in the rows of all poses."""
-    columns = []
-    for term in terms:
-        blocks = []
+def columns_of(terms: Sequence[MissingTerm], rows: Sequence[Rows], further: int = 0) -> list[Float[np.ndarray, "R _"]]:
+    """The columns of each term in the rows of all poses, and zeros in ``further`` ones after these."""
+    widths = [term.values.shape[-1] for term in terms]
+    of_tip = np.repeat([term.source is None for term in terms], widths)
+    sources = np.repeat([term.source or 0 for term in terms], widths)[~of_tip]
+    size = sum(part.residual.size for part in rows)
+    columns = np.zeros((size + further, sum(widths)))
+    for mask, by_tip in ((of_tip, True), (~of_tip, False)):
+        chosen = [term.values for term in terms if (term.source is None) == by_tip]
+        if not chosen:
+            continue
+        values, blocks = np.concatenate(chosen, axis=-1), []
         for part in rows:
-            values = term.values[part.poses]
-            source = term.source
-            moved = part.by_tip @ values if source is None else part.extra[..., [source]] * values[:, None]
+            at = values[part.poses]
+            moved = part.by_tip @ at if by_tip else part.extra[..., sources] * at[:, None]
             blocks.append(moved.reshape(part.residual.size, -1))
-        columns.append(np.concatenate(blocks))
-    return columns
+        columns[:size, mask] = np.concatenate(blocks)
+    return np.split(columns, np.cumsum(widths)[:-1], axis=1) if widths else []
 
 
 def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:

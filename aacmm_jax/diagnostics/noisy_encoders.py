@@ -26,7 +26,7 @@ from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import shorten
 from ..data.noise import Noise, one_arcsec
-from .culprits import MOST_CAUSES, culprits_of, explained
+from .culprits import MOST_CAUSES, culprits_of, explained, is_clear
 from .equations import Block, Rows
 from .findings import Case, Finding, by_equations, chance_text, look_for_play, reading_text
 from .residual_tests import SURE, Residuals, chance_above_zero
@@ -268,7 +268,7 @@ def noise_by_joint(case: Case) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
     j = noisiest.joint - 1
     loose = [part._replace(private=np.concatenate([part.private, part.extra[..., [j]]], axis=2)) for part in now.rows]
     within = now._replace(rows=loose).noisiest([j])
-    if within is None or within.probability >= SURE:
+    if within is None or within.probability >= SURE or is_clear(case, _CLEAR):
         return None
     noisy, u, others = [], np.zeros(0), list(range(joints))
     while noisiest is not None and noisiest.probability < SURE and len(noisy) < joints - 1:
@@ -280,8 +280,6 @@ def noise_by_joint(case: Case) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
     variances, index = now.variances[:-1], [test.joint - 1 for test in noisy]
     stated = equations.variances[:-1] if given else np.full(joints, variances[others[0]])
     if np.any(variances[index] <= stated[index]):
-        return None
-    if any(cause.kind != "noisy joint" and cause.probability < _CLEAR for cause in culprits_of(case)):
         return None
     kinds = record.calibrated.arm.geometry.kinds
     units = np.broadcast_to(one_arcsec(kinds), (joints,))

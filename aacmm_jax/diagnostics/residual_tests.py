@@ -126,24 +126,28 @@ class Candidates(NamedTuple):
         """Each against the model. A column of which the model leaves less than ``least`` counts as the model's own."""
         norms = np.linalg.norm(self.projected, axis=0)
         present = (norms**2 > _EXPLAINED) & (self.lengths * norms > least)
-        score, tests = np.where(present, left.values @ self.projected, 0.0), []
-        square = np.where(present, norms**2, 1.0)
-        for part in self.parts:
-            width = part.stop - part.start
-            if width == 1:
-                along = score[part] / np.sqrt(square[part])
-                gain, added, step = float(along[0] ** 2), int(present[part][0]), along / np.sqrt(square[part])
-            else:
-                columns = np.where(present[part], self.projected[:, part], 0.0)
-                values, vectors = np.linalg.eigh(columns.T @ columns)
-                seen = values > _EXPLAINED
-                along, added = vectors[:, seen].T @ score[part], int(seen.sum())
-                gain, step = float(np.sum(along**2 / values[seen])), vectors[:, seen] @ (along / values[seen])
-            freedom, step = left.degrees_of_freedom - added, step / self.lengths[part]
-            test = ScoreTest(0.0, 0.0, (added, freedom), 1.0, step)
+        columns, score = np.where(present, self.projected, 0.0), np.where(present, left.values @ self.projected, 0.0)
+        starts, widths = (
+            np.array([(part.start, part.stop - part.start) for part in self.parts], dtype=int).reshape(-1, 2).T
+        )
+        gains, ranks, steps = np.zeros(len(widths)), np.zeros(len(widths), dtype=int), np.zeros(len(score))
+        for width in np.unique(widths[widths > 0]):  # all of one width at once
+            among = widths == width
+            index = starts[among][:, None] + np.arange(width)
+            of_each = np.moveaxis(columns[:, index], 0, 1)
+            values, vectors = np.linalg.eigh(of_each.swapaxes(1, 2) @ of_each)
+            seen = values > _EXPLAINED
+            along = np.where(seen, np.einsum("nab,na->nb", vectors, score[index]), 0.0)
+            over = along / np.where(seen, values, 1.0)
+            gains[among], ranks[among] = np.sum(along * over, axis=1), seen.sum(axis=1)
+            steps[index] = np.einsum("nab,nb->na", vectors, over)
+        steps, tests, available, cost = steps / self.lengths, [], left.degrees_of_freedom, left.cost
+        for part, gain, added in zip(self.parts, gains.tolist(), ranks.tolist(), strict=True):
+            freedom = available - added
+            test = ScoreTest(0.0, 0.0, (added, freedom), 1.0, steps[part])
             if added and freedom > 0:
-                ratio = gain / added / max((left.cost - gain) / freedom, 1e-300)
-                test = ScoreTest(gain, ratio, (added, freedom), f_tail(ratio, added, freedom), step)
+                ratio = gain / added / max((cost - gain) / freedom, 1e-300)
+                test = ScoreTest(gain, ratio, (added, freedom), f_tail(ratio, added, freedom), steps[part])
             tests.append(test)
         return tests
 
