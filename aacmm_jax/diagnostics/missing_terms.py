@@ -95,6 +95,8 @@ def wider_model(terms: Sequence[FoundTerm], arm: Arm | None) -> str:
 
 def columns_of(terms: Sequence[MissingTerm], rows: Sequence[Rows], further: int = 0) -> list[Float[np.ndarray, "R _"]]:
     """The columns of each term in the rows of all poses, and zeros in ``further`` ones after these."""
+    if not terms:
+        return []
     widths = [term.values.shape[-1] for term in terms]
     of_tip = np.repeat([term.source is None for term in terms], widths)
     sources = np.repeat([term.source or 0 for term in terms], widths)[~of_tip]
@@ -110,7 +112,7 @@ def columns_of(terms: Sequence[MissingTerm], rows: Sequence[Rows], further: int 
             moved = part.by_tip @ at if by_tip else part.extra[..., sources] * at[:, None]
             blocks.append(moved.reshape(part.residual.size, -1))
         columns[:size, mask] = np.concatenate(blocks)
-    return np.split(columns, np.cumsum(widths)[:-1], axis=1) if widths else []
+    return np.split(columns, np.cumsum(widths)[:-1], axis=1)
 
 
 def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
