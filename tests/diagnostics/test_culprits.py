@@ -6,8 +6,8 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.diagnostics import findings_of
-from aacmm_jax.diagnostics.culprits import culprits_of
-from aacmm_jax.diagnostics.findings import case_of
+from aacmm_jax.diagnostics.culprits import culprits_of, is_clear
+from aacmm_jax.diagnostics.findings import Case, case_of
 from aacmm_jax.kinematics import ArmSpecification
 
 ARCSEC = aj.units.ARCSEC
@@ -83,6 +83,10 @@ def test_the_cause_stands_first(paper_arm, capture, errors, code, concerns, word
     assert first.explains > 0.8
     assert not record.noisy_encoders
     assert [finding.code for finding in others if finding.severity != "note"] == []
+    halted, whole = Case(record), Case(record)  # a search that stopped at the first cause, and went on, is the same
+    assert is_clear(halted, 1e-4)
+    names = [[(c.kind, c.name, c.explains) for c in culprits_of(case)] for case in (halted, whole)]
+    assert names[0] == names[1]
 
 
 @pytest.mark.slow
@@ -90,6 +94,7 @@ def test_a_sound_capture_has_no_cause(paper_arm, capture):
     nominal = ArmSpecification(paper_arm, "test")
     record = aj.calibrate_capture(aj.Recording(capture, nominal), automatic=False, cross_validate=False)
     assert culprits_of(case_of(record)) == ()
+    assert not is_clear(Case(record), 1e-4)
     assert [finding for finding in findings_of(record) if finding.severity != "note"] == []
 
 
