@@ -168,6 +168,14 @@ class Readings:
         angles = self._angles
         unit = wanted.unit or (None if angles is None else angles.unit)
         angular, linear = header_units(text, picked, arm, unit)
+        if angles is not None and angles.lerobot_unit is not None:
+            if wanted.unit is not None:
+                raise InputError(
+                    f"{text.path} has a unit of its own, but [angles] has calibration, with which LeRobot's numbers "
+                    f"become angles; remove the unit of this table, and state it in [angles] ({angles.lerobot_unit} now)."
+                )
+            checked_unit(text.path, "readings", angular, angles.lerobot_unit, None, (angles.lerobot_unit,))
+            angular = None
         if angular == "counts" and unit is None:
             raise InputError(
                 f'{text.path} has readings in counts; add [angles] with unit = "counts" and counts_per_turn = [...].'
