@@ -171,8 +171,8 @@ class Readings:
         if angles is not None and angles.lerobot_unit is not None:
             if wanted.unit is not None:
                 raise InputError(
-                    f"{text.path} has a unit of its own, but [angles] has calibration, with which LeRobot's numbers "
-                    f"become angles; remove the unit of this table, and state it in [angles] ({angles.lerobot_unit} now)."
+                    f"{text.path}: the manifest states a unit for this table, but LeRobot's numbers are in that of "
+                    f"[angles], which has calibration ({angles.lerobot_unit}); remove the unit of the table."
                 )
             checked_unit(text.path, "readings", angular, angles.lerobot_unit, None, (angles.lerobot_unit,))
             angular = None

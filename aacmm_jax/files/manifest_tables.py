@@ -7,13 +7,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from jaxtyping import Float
 from pydantic import (
-    PrivateAttr,
     AfterValidator,
     BeforeValidator,
     Field,
     FiniteFloat,
     NonNegativeFloat,
     PositiveFloat,
+    PrivateAttr,
     create_model,
     model_validator,
 )
