@@ -3,7 +3,7 @@
 import json
 import math
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import typer
@@ -11,8 +11,9 @@ import typer
 from .. import files, kinematics, summaries
 from ..core.errors import InputError
 from ..core.text import printable, shorten
-from ..files.inputs import InputFile
+from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import check_kept, together, write_text
+from ..kinematics.arm import correction_names
 from . import options
 from .app import command, show_summary, warn_of_unusable
 from .arm_command import first_frame
@@ -179,7 +180,8 @@ def _text(record: Any, specification: Any, form: str, calibrated: bool) -> str:
     if form == "ur":
         return files.ur_kinematics_yaml(specification.arm)
     if form == "offsets":
-        return files.zero_offsets_csv(_zero_offsets(record))
+        comments = "".join(f"# {note}\n" for note in _of_models(record))
+        return comments + files.zero_offsets_csv(_zero_offsets(record))
     scale = "" if math.isnan(record.k) else f", k = {record.k:.8f}"
     source = f"calibrated from {len(capture.readings)} poses, {record.method}{scale}" if calibrated else ""
     if form == "toml":
@@ -211,7 +213,30 @@ def _zeros_in_file(record: Any, form: str, file: Path | None, motors: str | None
         written = files.ros_calibration(source, zeros)
     else:
         written = ZERO_FILES[form](InputFile(file), zeros, None if motors is None else names_option(motors))
-    return written.text, [*remaining_error(zeros), *_signs_of(record, zeros, motors), *written.notes]
+    notes = [*remaining_error(zeros), *_of_models(record), *_signs_of(record, zeros, motors), *written.notes]
+    if form == "lerobot" and not _recorded_with(record, InputFile(cast(Path, file))):
+        notes.append(
+            f"Warning: the readings were not recorded with {file} (calibration = ... in [angles] of the manifest), so "
+            "the offsets are wrong by any difference between its zeros and those of the readings; do not use them "
+            "unless the zeros are the same."
+        )
+    return written.text, notes
+
+
+def _recorded_with(record: Any, file: InputFile) -> bool:
+    """Whether a controller's file is one of those from which the readings became angles."""
+    digest = fingerprint(file).rpartition(" (")[2]
+    return any(source.endswith(digest) for source in record.recording.sources)
+
+
+def _of_models(record: Any) -> list[str]:
+    """Which model zero offsets are to be calibrated with, where it was another."""
+    if not correction_names(record.calibrated.arm):
+        return []
+    return [
+        "The calibration models errors of the joints, which zero offsets cannot hold; for offsets, calibrate with "
+        "--model dh."
+    ]
 
 
 def _signs_of(record: Any, zeros: Any, motors: str | None) -> list[str]:

@@ -168,6 +168,14 @@ class Readings:
         angles = self._angles
         unit = wanted.unit or (None if angles is None else angles.unit)
         angular, linear = header_units(text, picked, arm, unit)
+        if angles is not None and angles.lerobot_unit is not None:
+            if wanted.unit is not None:
+                raise InputError(
+                    f"{text.path}: the manifest states a unit for this table, but LeRobot's numbers are in that of "
+                    f"[angles], which has calibration ({angles.lerobot_unit}); remove the unit of the table."
+                )
+            checked_unit(text.path, "readings", angular, angles.lerobot_unit, None, (angles.lerobot_unit,))
+            angular = None
         if angular == "counts" and unit is None:
             raise InputError(
                 f'{text.path} has readings in counts; add [angles] with unit = "counts" and counts_per_turn = [...].'

@@ -13,6 +13,7 @@ from pydantic import (
     FiniteFloat,
     NonNegativeFloat,
     PositiveFloat,
+    PrivateAttr,
     create_model,
     model_validator,
 )
@@ -70,6 +71,7 @@ class Angles(Strict):
     coupled: dict[Annotated[str, Field(pattern="^[1-9][0-9]?$")], Annotated[int, Field(ge=-99, le=99)]] | None = None
 
     calibration: str | None = None  # LeRobot's file of the motors
+    _lerobot: str | None = PrivateAttr(None)
 
     @model_validator(mode="after")
     def _counts(self) -> "Angles":
@@ -88,6 +90,16 @@ class Angles(Strict):
             raise ValueError(
                 "counts_per_mm and linear_unit = 'counts' are only possible together; give both or neither."
             )
+        return self
+
+    @property
+    def lerobot_unit(self) -> str | None:
+        """The unit that [angles] stated for LeRobot's numbers, where these are what its counts were made of."""
+        return self._lerobot
+
+    def of_lerobot(self, unit: str) -> "Angles":
+        """The same, as what LeRobot's numbers in this unit became."""
+        self._lerobot = unit
         return self
 
     def read_as(self, joints: int) -> tuple[int, ...] | None:

@@ -87,8 +87,9 @@ def reading_columns(
     names: Sequence[str] = (),
 ) -> list[int]:
     """The columns of the joint readings, from 0: those ``stated``, else those with the ``names`` that the arm's file
-    gives its joints, or with usual names of joints, or all that are not ``taken`` where these are as many as the
-    joints, and nothing in the header contradicts it.
+    gives its joints, or that LeRobot gives its motors (``shoulder_pan.pos``, without the gripper), or with usual names
+    of joints, or all that are not ``taken`` where these are as many as the joints, and nothing in the header
+    contradicts it.
 
     ``line`` is what states columns, for messages. Raises `InputError` with the line to add where several sets of
     columns have such names, their numbers do not ascend, or they are ``required`` and not clear.
@@ -111,6 +112,10 @@ def reading_columns(
         picked = [titles.index(name) for name in names]
         _check_not_taken(table, picked, taken)
         return picked
+    motors = [i for i, title in enumerate(table.header) if bare_name(title).endswith(".pos")]
+    motors = [i for i in motors if titles[i] != "gripper"]
+    if len(motors) == joints and not set(motors) & set(taken):  # LeRobot's, in the order of the joints
+        return motors
     families = _families(table, joints)
     named = [family for family in families if family.of_joints and not set(family.columns) <= set(taken)]
     whole = [family.columns for family in named if family.whole]

@@ -81,7 +81,8 @@ def angles_by_motors(angles: Angles, file: InputFile, joints: int) -> Angles:
         middles = [(motor.range_min + motor.range_max) / 2 for motor in chosen]
         offsets = [offset + middle for offset, middle in zip(offsets, middles, strict=False)]
     stated = angles.model_dump(exclude_unset=True, exclude={"calibration"})
-    return Angles(**{**stated, "unit": "counts", "counts_per_turn": counts, "sign": signs, "offset": offsets})
+    converted = {**stated, "unit": "counts", "counts_per_turn": counts, "sign": signs, "offset": offsets}
+    return Angles(**converted).of_lerobot(angles.unit)
 
 
 def lerobot_calibration(

@@ -135,6 +135,7 @@ def test_export_by_the_command_line(tmp_path):
             in said
         )
         assert "over all joint limits by" in said
+        assert ("not recorded with motors.json" in said) == (name == "lerobot")
     assert (tmp_path / "kuka.out").read_bytes().count(b"\r\n") == DATA.count("\r\n")
     offsets = command_line(tmp_path, *export, "offsets").stdout
     second = float(next(line for line in offsets.splitlines() if line.startswith("2,")).split(",")[1])

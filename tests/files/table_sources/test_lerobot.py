@@ -136,6 +136,32 @@ def test_a_feature_that_is_not_there_is_one_sentence(tmp_path):
     assert_refused(lambda: TextTable(tmp_path / "set", tables=["state"]), "no feature 'state'", "'observation.state'")
 
 
+def table(tmp_path, end, more=""):
+    """A recording of a text table with LeRobot's names, without columns stated."""
+    header = ",".join(f"{name}.pos{end}" for name in NAMES)
+    np.savetxt(tmp_path / "set.csv", READ["deg"], delimiter=",", header=header, comments="")
+    (tmp_path / "motors.json").write_text(json.dumps(MOTORS))
+    angles = '[angles]\nunit = "deg"\ncalibration = "motors.json"\n'
+    (tmp_path / "capture.toml").write_text(f'arm = "{ARM}"\n{angles}[[socket]]\nname = "A"\nfile = "set.csv"\n{more}')
+    return aj.files.read_manifest(tmp_path / "capture.toml")
+
+
+@pytest.mark.parametrize("end", ["", " [deg]"])
+def test_motors_of_a_shipped_arm_are_its_joints(tmp_path, end):
+    np.testing.assert_allclose(table(tmp_path, end).capture.sockets["A"], ANGLES[:, :5], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("end", "more", "part"),
+    [
+        (" [rad]", "", "says rad, but the manifest says deg"),
+        ("", 'units = { q = "deg" }\n', "remove the unit of the table"),
+    ],
+)
+def test_units_that_differ_from_those_of_the_calibration(tmp_path, end, more, part):
+    assert_refused(lambda: table(tmp_path, end, more), part)
+
+
 @pytest.mark.slow
 def test_damage_is_one_sentence_or_other_cells(tmp_path):
     data_set(tmp_path / "set", READ["deg"])
