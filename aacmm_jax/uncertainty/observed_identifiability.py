@@ -71,19 +71,22 @@ class Agreeing(NamedTuple):
             # What is certified does not count: the fit in mm.
             linear = _linear(source, observed, z, certified=0.0)
             # Of images that are not those of the poses, steps lead to corners at the height of the camera.
-            if not all(np.isfinite(rows.values).all() and np.isfinite(rows.by_tip).all() for rows in linear.point.rows):
+            new = np.asarray(linear.fitted(np.arange(len(z)) < p)) if _is_finite(linear) else np.full_like(z, np.nan)
+            if not np.isfinite(new).all():
                 z = start
                 break
-            new = np.asarray(linear.fitted(np.arange(len(z)) < p))
             step, z = np.max(np.abs(new - z), initial=0.0), new
             if step < _FITTED:
                 break
         z = np.concatenate([np.asarray(space.vector()), z[p:]])
+        linear = _linear(space, observed, z)
         for _ in range(_ROUNDS):
-            linear = _linear(space, observed, z)
             if max(np.abs(rows.values).max() for rows in linear.point.rows) < _AGREES:
                 break
-            observed = _moved(linear)
+            moved = _linear(space, _moved(linear), z)
+            if not _is_finite(moved):
+                break
+            linear = moved
         return cls(linear, ends_of(capture), np.array([float(length.u) for length in capture.lengths]))
 
     def eliminated(self, weigh: Noise | float | None = None) -> Eliminated:
@@ -188,6 +191,10 @@ def _without_components(influence: Influence) -> list[Float[np.ndarray, "h r m"]
                 private, influence.d_inverses[block.class_index] @ left[block.class_index], block.sizes
             )
     return eliminated
+
+
+def _is_finite(linear: Linearisation) -> bool:
+    return all(np.isfinite(rows.values).all() and np.isfinite(rows.by_tip).all() for rows in linear.point.rows)
 
 
 def _moved(linear: Linearisation) -> Observed:

@@ -10,6 +10,8 @@ from aacmm_jax.data import observations as kinds
 from aacmm_jax.uncertainty.observed_identifiability import Agreeing
 from aacmm_jax.uncertainty.target_parameters import independent_of_targets
 
+from ..conftest import EXAMPLES
+
 NOISE = aj.Noise(encoder_arcsec=2, seating=0.005)
 SLOW = pytest.mark.slow
 BOX = [[200, -300, 100], [600, 300, 500]]
@@ -171,3 +173,12 @@ def test_calibrate_warns_of_what_observations_leave_open(paper_arm):
         aj.calibrate(paper_arm, capture, aj.Bounds.around(paper_arm, space), noise=NOISE)
     with pytest.raises(aj.InputError, match="theta_1 and frame of T trade off"):
         aj.calibrate(paper_arm, capture, aj.Bounds.around(paper_arm, space), noise=NOISE, undetermined="raise")
+
+
+def test_images_of_other_poses_determine_something_finite():
+    """A fit of the geometry that diverges ends where it began."""
+    recording = aj.files.read_manifest(EXAMPLES / "webcam/webcam.toml")
+    (images,) = recording.capture.observations
+    exchanged = images.changed(q=np.random.default_rng(35).permutation(np.asarray(images.q)))
+    found = aj.observability(recording.nominal.arm, aj.Capture({}, observations=[exchanged]))
+    assert np.isfinite(found.singular).all()
