@@ -108,6 +108,7 @@ def uncertainty_statement(record: CalibrationRecord) -> str:
     model = "Denavit-Hartenberg model"
     if record.calibrated.arm.corrections is not None:
         model += " with the joint corrections below"
+    unmodelled = "not included" if record.shared is None else "included as far as the residuals show them"
     return (
         "Each expanded uncertainty is the standard uncertainty times the coverage factor stated beside it. This "
         f"factor follows from Student's t distribution for a coverage probability of {LEVEL_IN_PERCENT} and the "
@@ -115,7 +116,7 @@ def uncertainty_statement(record: CalibrationRecord) -> str:
         "The standard uncertainties follow, by the law of propagation of uncertainty, from the noise of the "
         f"readings, {noise}, and from the {sources}. Each uncertainty is for one parameter alone; the covariance "
         "matrix gives the correlations. Expanded uncertainties are rounded to two digits, and values to the same "
-        f"decimal place. Errors that the {model} does not describe are not included."
+        f"decimal place. Errors that the {model} does not describe are {unmodelled}."
     )
 
 

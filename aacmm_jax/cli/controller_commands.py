@@ -13,7 +13,6 @@ from ..core.errors import InputError
 from ..core.text import printable, shorten
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import check_kept, together, write_text
-from ..kinematics.arm import correction_names
 from . import options
 from .app import command, show_summary, warn_of_unusable
 from .arm_command import first_frame
@@ -231,12 +230,8 @@ def _recorded_with(record: Any, file: InputFile) -> bool:
 
 def _of_models(record: Any) -> list[str]:
     """Which model zero offsets are to be calibrated with, where it was another."""
-    if not correction_names(record.calibrated.arm):
-        return []
-    return [
-        "The calibration models errors of the joints, which zero offsets cannot hold; for offsets, calibrate with "
-        "--model dh."
-    ]
+    said = "The calibration models errors of the joints, which zero offsets cannot hold: calibrate with --model dh."
+    return [] if record.calibrated.arm.corrections is None else [said]
 
 
 def _signs_of(record: Any, zeros: Any, motors: str | None) -> list[str]:
