@@ -3,7 +3,7 @@
 import json
 import math
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 import typer
@@ -213,7 +213,7 @@ def _zeros_in_file(record: Any, form: str, file: Path | None, motors: str | None
     else:
         written = ZERO_FILES[form](InputFile(file), zeros, None if motors is None else names_option(motors))
     notes = [*remaining_error(zeros), *_of_models(record), *_signs_of(record, zeros, motors), *written.notes]
-    if form == "lerobot" and not _recorded_with(record, InputFile(cast(Path, file))):
+    if form == "lerobot" and file is not None and not _recorded_with(record, InputFile(file)):
         notes.append(
             f"Warning: the readings were not recorded with {file} (calibration = ... in [angles] of the manifest), so "
             "the offsets are wrong by any difference between its zeros and those of the readings; do not use them "
