@@ -29,6 +29,7 @@ BLOCK = re.compile(
 )
 # Pages with nothing to run are read here; of the others, each costs a calibration or more, and these more than 10 s.
 EXHAUSTIVE = {"explanation/random_splits.md", "how_to/planning.md", "how_to/studies.md"}
+COMPARED = {"readers/measuring_arm_worked.md", "readers/robot_with_tracker.md"}  # pages whose outputs are compared
 
 
 class Snippet(NamedTuple):
@@ -58,6 +59,12 @@ def commands(text: str) -> list[list[str]]:
 def variables(text: str) -> list[str]:
     """The environment variables that a console block sets."""
     return re.findall(r"^\$ export (\w+=.*)$", text, flags=re.MULTILINE)
+
+
+def outputs(text: str) -> list[re.Pattern[str]]:
+    """What a console block shows below each command, a word after the other; ``...`` is any text, or none."""
+    shown = re.split(r"^\$ aacmm.*\n", text.replace("\\\n", " "), flags=re.MULTILINE)[1:]
+    return [re.compile(".*".join(re.escape(" ".join(x.split())) for x in part.split("..."))) for part in shown]
 
 
 def marks(page: str) -> list[pytest.MarkDecorator]:
@@ -94,8 +101,9 @@ def run_snippets(page, tmp_path, monkeypatch):
         else:
             for variable in variables(text):
                 monkeypatch.setenv(*variable.split("=", 1))
-            for command in commands(text):
-                command_line(tmp_path, *command[1:])
+            for command, output in zip(commands(text), outputs(text), strict=True):
+                printed = " ".join(command_line(tmp_path, *command[1:]).stdout.split())
+                assert page not in COMPARED or output.search(printed), (output.pattern, printed)
 
 
 @contextlib.contextmanager
@@ -116,6 +124,9 @@ def test_blocks_are_found(tmp_path, monkeypatch):
     file, console = snippets("page.md")
     assert file == ("toml", "x = 1\n", "a.toml")
     assert commands(console.text) == [["aacmm", "show", "a.h5"]]
+    (output,) = outputs(console.text.replace("printed", "a ...\nprinted"))
+    assert output.search("a b printed")
+    assert not output.search("a b painted")
 
 
 def test_pages_that_take_long_exist():
