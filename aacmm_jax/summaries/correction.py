@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..core.text import pluralise, shorten
 from ..core.units import DEG
@@ -13,6 +13,7 @@ from .tables import View, formatted, listed, plain, warnings_of, written_of
 
 _SINGULAR = 3.0  # mm a rad: 1 mm takes 20 deg of the joints; axes of a wrist are within half a degree of each other
 _LARGE_CHANGE = 5.0  # deg: ten times what link errors of 1 mm and 1 mrad take where no axes align
+_BEYOND = 0.1  # of the travel of a joint in the poses of the calibration
 _MOST_ROWS = 20  # that are printed
 
 
@@ -95,6 +96,29 @@ def correction_summary(
             "corrections need large motions. Check these rows before you send an arm to these poses."
         )
     return summary
+
+
+def outside_recorded(
+    nominal: Arm, recorded: Float[np.ndarray, "m n"], q: Float[np.ndarray, "N n"], reached: Bool[np.ndarray, " N"]
+) -> list[str]:
+    """A warning where joints go beyond the poses of the calibration by more than a tenth of their travel there."""
+    low, high = recorded.min(axis=0), recorded.max(axis=0)
+    margin = _BEYOND * (high - low) + by_joint(nominal, 1.0 * DEG, 1.0)
+    beyond = ((q < low - margin) | (q > high + margin)) & reached[:, None]
+    rows, joints = (np.flatnonzero(beyond.any(axis=axis)) + 1 for axis in (1, 0))
+    if not len(rows):
+        return []
+    unit = by_joint(nominal, 1 / DEG, 1.0)
+    travels = [
+        f"joint {i}: {low[i - 1] * unit[i - 1]:.0f} to {high[i - 1] * unit[i - 1]:.0f} "
+        f"{'mm' if i in nominal.prismatic else 'deg'}"
+        for i in joints.tolist()
+    ]
+    return [
+        f"In {pluralise(len(rows), 'row')} (row {shorten([str(row) for row in rows])}) joints are outside the range "
+        f"that the poses of the calibration cover ({', '.join(travels)}). There, the correction is an extrapolation by "
+        "the model; record poses there as well."
+    ]
 
 
 def corrections(summary: dict[str, Any]) -> View:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import aacmm_jax as aj
 from aacmm_jax.cli.commanded import in_first_frame
 from aacmm_jax.kinematics.inverse_kinematics import corrected_readings
-from aacmm_jax.summaries.correction import correction_summary
+from aacmm_jax.summaries.correction import correction_summary, outside_recorded
 
 from ..conftest import command_line
 
@@ -199,6 +199,16 @@ def test_positions_are_of_the_tip_or_of_a_target_by_its_name(tmp_path):
         assert any("give --probe ball" in text for text in summary["warnings"]) == (not options)
     said = command_line(tmp_path, *command[:-2], "bal", "--overwrite", expect=2).stderr
     assert "a target of the calibration (ball)" in " ".join(said.split())
+
+
+def test_rows_outside_the_range_of_the_calibration_are_named():
+    """Within a tenth of the range and a degree, nothing is said; nor of rows that are not reached."""
+    nominal, recorded = aj.load_arm("ur10e"), np.radians([np.zeros(6), np.full(6, 10)])
+    q = np.radians(np.array([[0, 5, 10, 5, 5, 5], [11.9] * 6, [12.1, 5, 5, 5, -2.1, 5], [90] * 6]))
+    (said,) = outside_recorded(nominal, recorded, q, np.array([True, True, True, False]))
+    assert said.startswith("In 1 row (row 3) joints are outside the range")
+    assert "(joint 1: 0 to 10 deg, joint 5: 0 to 10 deg)" in said
+    assert outside_recorded(nominal, recorded, q[:2], np.ones(2, dtype=bool)) == []
 
 
 def test_rows_at_a_singular_wrist_are_named():
