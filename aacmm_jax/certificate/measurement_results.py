@@ -210,7 +210,7 @@ def _equipment(
 
 def _certified_lengths(record: CalibrationRecord, evaluation: EvaluationRecord | None) -> dict[str, ReferenceLength]:
     """The lengths of the calibration, then those of the evaluation, by their names in the certificate."""
-    lengths = [("", record.recording.capture.lengths)]
+    lengths: list[tuple[str, Sequence[ReferenceLength]]] = [("", record.recording.capture.lengths)]
     if evaluation is not None:
         tested = evaluation.recording.capture.lengths
         lengths.append(("Test ", [tested[i] for i in evaluation.held_out_lengths()]))
