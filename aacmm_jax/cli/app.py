@@ -177,6 +177,17 @@ def read_with_progress(manifest: Path, overlays: Path | None = None) -> Any:
         return read_manifest(manifest, progress=tracked(bar), overlays=overlays)
 
 
+def read_recording(path: Path) -> Any:
+    """The recording of a capture, with the digest of its file first among its sources, or of a manifest."""
+    from ..files.captures import load_capture
+    from ..files.inputs import InputFile, fingerprint
+
+    if path.suffix == ".toml":
+        return read_with_progress(path)
+    recording = load_capture(read := InputFile(path))
+    return recording._replace(sources=(fingerprint(read), *recording.sources))
+
+
 def tracked(bar: Any) -> Callable[[Sequence[Any], str], Iterable[Any]]:
     """What yields items and shows on a bar how many are done, where there is one."""
     return lambda items, what: items if bar is None else bar.track(items, description=what)
