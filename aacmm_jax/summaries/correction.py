@@ -110,9 +110,7 @@ def correction_summary(
     return summary
 
 
-def _outside(
-    arm: Arm, q: Float[np.ndarray, "N n"], recorded: Float[np.ndarray, "M n"]
-) -> Float[np.ndarray, "N n"]:
+def _outside(arm: Arm, q: Float[np.ndarray, "N n"], recorded: Float[np.ndarray, "M n"]) -> Float[np.ndarray, "N n"]:
     """How far readings are outside the range of the recorded ones, rad and mm, whole revolutions aside; 0 within it or
     near it."""
     low, high = recorded.min(axis=0), recorded.max(axis=0)
