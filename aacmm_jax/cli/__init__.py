@@ -40,7 +40,7 @@ def main() -> None:
     try:
         from ..core.errors import InputError
         from ..files.outputs import asking
-        from .app import Stopped, app, check_numbers, prepare_jax
+        from .app import Stopped, app, check_numbers, prepare_jax, register_own_corrections
 
         for family in _FAMILIES:
             import_module(f".{family}", __name__)
@@ -52,8 +52,10 @@ def main() -> None:
         _interrupted()
     try:
         check_numbers(sys.argv[1:])
-        if sys.argv[1:2] != ["show"] and not {"--help", "--version"} & set(sys.argv):  # which rarely compute
-            prepare_jax()
+        if not {"--help", "--version"} & set(sys.argv):
+            if sys.argv[1:2] != ["show"]:  # which rarely computes
+                prepare_jax()
+            register_own_corrections()
         with contextlib.nullcontext() if overwrite else asking():
             app(prog_name="aacmm")
     except SystemExit as done:

@@ -4,17 +4,23 @@ import contextlib
 import inspect
 import json
 import math
+import os
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from importlib import metadata
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
+from types import ModuleType
 from typing import Any, get_args, get_type_hints
 
 import typer
 import typer.core
 
-from ..core.errors import InputError
+from ..core.errors import InputError, naming
 from ..core.jax_setup import prepare_command
 from ..core.text import in_short, is_number, printable, quoted
+
+_OWN_CORRECTIONS = "AACMM_CORRECTIONS"  # environment variable: a Python file
 
 
 class Stopped(Exception):
@@ -54,7 +60,8 @@ app = typer.Typer(
     context_settings={"max_content_width": 120},
     help="Calibrate articulated-arm coordinate measuring machines and other serial arms.",
     epilog="Every command accepts --help, --debug (shows the traceback of a failure) and --overwrite (replaces files "
-    "that aacmm did not write). Start with: aacmm demo",
+    "that aacmm did not write). The environment variable AACMM_CORRECTIONS names a Python file with joint corrections "
+    "of your own. Start with: aacmm demo",
 )
 
 
@@ -120,6 +127,27 @@ def prepare_jax() -> None:
         typer.echo(warning, err=True)
 
 
+def register_own_corrections() -> None:
+    """Run the Python file that the environment names, which registers joint corrections of the user's own."""
+    path = os.environ.get(_OWN_CORRECTIONS)
+    if not path:
+        return
+    loader = SourceFileLoader("own_corrections", path)
+    module = ModuleType(loader.name)
+    module.__file__ = os.path.abspath(path)
+    sys.modules[loader.name] = module
+    try:
+        with naming(f"{path} ({_OWN_CORRECTIONS})"):
+            loader.exec_module(module)
+    except InputError:
+        raise
+    except Exception as error:
+        what = f"{type(error).__name__}: {error}"
+        raise InputError(
+            f"{path}, the file that {_OWN_CORRECTIONS} names, cannot be run: {what}; correct it."
+        ) from error
+
+
 def with_spinner(what: str, work: Callable[[], Any]) -> Any:
     """Do work, with a spinner on standard error where that is a terminal."""
     from rich.console import Console
@@ -147,6 +175,17 @@ def read_with_progress(manifest: Path, overlays: Path | None = None) -> Any:
 
     with progress_bar(transient=True) as bar:
         return read_manifest(manifest, progress=tracked(bar), overlays=overlays)
+
+
+def read_recording(path: Path) -> Any:
+    """The recording of a capture, with the digest of its file first among its sources, or of a manifest."""
+    from ..files.captures import load_capture
+    from ..files.inputs import InputFile, fingerprint
+
+    if path.suffix == ".toml":
+        return read_with_progress(path)
+    recording = load_capture(read := InputFile(path))
+    return recording._replace(sources=(fingerprint(read), *recording.sources))
 
 
 def tracked(bar: Any) -> Callable[[Sequence[Any], str], Iterable[Any]]:

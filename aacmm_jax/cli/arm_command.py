@@ -16,7 +16,7 @@ from ..files.outputs import together, write_text
 from ..summaries.tables import Styled, View, formatted, listed, number, warnings_of, written_of
 from ..uncertainty.coverage import COVERAGE_FACTOR, K_IN_WORDS
 from . import options, views
-from .app import command, read_with_progress, show_summary, with_spinner
+from .app import command, read_recording, show_summary, with_spinner
 from .options import argument, numbers_option, option
 
 _CAPTURES = (".toml", ".h5")  # others are tables
@@ -90,7 +90,8 @@ def arm(
         return
     if file is None:
         raise InputError(
-            "no arm is given; name an arm file or a shipped arm, or write a template with --new my-arm.toml."
+            "no arm is given; name an arm file, write a template with --new my-arm.toml, or name a shipped arm: "
+            f"{', '.join(files.shipped_arms())}."
         )
     if joints is not None:
         raise InputError("--joints applies to a template only; give --new too.")
@@ -139,7 +140,7 @@ def _checked(specification: Any, path: Path, unit: str | None) -> dict[str, Any]
         raise InputError(
             f"--unit applies to tables only, but {path} itself states the unit of the readings; leave out --unit."
         )
-    recording = read_with_progress(path) if suffix == ".toml" else files.load_capture(InputFile(path))
+    recording = read_recording(path)
     joints = recording.nominal.arm.joints
     if joints != specification.arm.joints:
         raise InputError(

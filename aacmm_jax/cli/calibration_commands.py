@@ -15,7 +15,7 @@ from ..files.outputs import reading, together, write_text
 from ..model.loss_names import LossName
 from ..uncertainty.coverage import LEVEL
 from . import arm_options, options, views
-from .app import command, read_with_progress, show_summary, with_spinner
+from .app import command, read_recording, show_summary, with_spinner
 from .options import argument, flag, option, output, seed
 
 
@@ -201,11 +201,7 @@ def _recording(paths: Sequence[Path], same_probe: bool) -> Any:
         raise InputError("--same-probe applies to several captures only; name all captures, or leave out --same-probe.")
     sessions = {}
     for path in paths:
-        if path.suffix == ".toml":
-            recording = read_with_progress(path)
-        else:
-            recording = files.load_capture(read := InputFile(path))
-            recording = recording._replace(sources=(fingerprint(read), *recording.sources))
+        recording = read_recording(path)
         if path.stem in sessions:
             raise InputError(
                 f"two captures have the file name '{path.stem}', which becomes the name of the session; rename "
@@ -274,7 +270,7 @@ def compare_models(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", IdentifiabilityWarning)
         compared = with_spinner("Comparing models", lambda: run(
-            nominal.arm, part, nominal.bounds(), models=chosen, regions=leave_out, noise=noise, **masses_of(nominal)
+            nominal, part, models=chosen, regions=leave_out, noise=noise, **masses_of(nominal)
         ))  # fmt: skip
     summary = summaries.compared_models.compared_models_summary(compared, nominal.name)
     summary["poses"] = len(part.readings)

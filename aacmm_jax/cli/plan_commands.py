@@ -299,6 +299,7 @@ def _planned(specification: Any, given: Mapping[str, Any], links: Mapping[str, A
         margin=given["margin_deg"] * DEG,
         above=given["above_mm"],
         check_length=given["check_length_mm"],
+        hold_undetermined=given["held"] is None,
         chains=tuple(given["chain"] or ()),
         rest=_rest(given["rest"], specification.arm, given["angles"]),
         **{name: given[name] for name in ("criterion", "unconstrained", "candidates", "seed")},

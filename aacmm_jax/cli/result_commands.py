@@ -14,7 +14,7 @@ from ..files.inputs import ROBOT_FILES, InputFile, fingerprint
 from ..files.outputs import together
 from ..files.stored_checks import check_shown
 from . import options, views
-from .app import command, prepare_jax, show_summary, with_spinner
+from .app import command, prepare_jax, read_recording, show_summary, with_spinner
 from .arm_command import first_frame
 from .options import argument, option, output
 
@@ -43,7 +43,11 @@ def evaluate(
         "given.",
         "CALIBRATION.h5",
     ),
-    capture: Path | None = argument("Capture, written by aacmm import or aacmm simulate.", "CAPTURE.h5", None),
+    capture: Path | None = argument(
+        "Capture, written by aacmm import or aacmm simulate; or the manifest of one.",
+        "CAPTURE.h5|MANIFEST.toml",
+        None,
+    ),
     output: Path | None = output("File to write the evaluation to (HDF5); aacmm report reads it.", "FILE.h5", None),
     only: list[str] | None = options.ONLY,
     without: list[str] | None = options.WITHOUT,
@@ -124,7 +128,7 @@ def evaluate(
             record = evaluate_points(_points(calibration), **chosen._asdict())
             summarise = summaries.evaluation.points_summary
         else:
-            record = _evaluation(InputFile(calibration), InputFile(capture), chosen)
+            record = _evaluation(InputFile(calibration), capture, chosen)
             summarise = summaries.evaluation.evaluation_summary
         summary = with_spinner("Evaluating", lambda: summarise(record))
         if output is not None:
@@ -137,12 +141,12 @@ def evaluate(
         raise typer.Exit(1)
 
 
-def _evaluation(calibration: InputFile, capture: InputFile, chosen: Any) -> Any:
+def _evaluation(calibration: InputFile, capture: Path, chosen: Any) -> Any:
     """The record of a calibration evaluated on a capture, whose warnings the calibration's file may have."""
     from ..pipeline.capture_evaluation import evaluate_capture
 
-    record, recording = files.load_calibration(calibration), files.load_capture(capture)
-    sources = (fingerprint(calibration), fingerprint(capture), *recording.sources)
+    record, recording = files.load_calibration(calibration), read_recording(capture)
+    sources = (fingerprint(calibration), *recording.sources)
     stored = read_summary(calibration, ("calibration",))[1]
     chosen = chosen._replace(calibration_warnings=None if stored is None else stored["warnings"])
     return evaluate_capture(record, recording._replace(sources=sources), **chosen._asdict())

@@ -7,11 +7,11 @@ from typing import Any
 import typer
 
 from .. import files, plot, summaries
-from ..files.inputs import InputFile, fingerprint
+from ..files.inputs import fingerprint
 from ..files.outputs import together, write_atomically
 from ..summaries.tables import View
 from . import options
-from .app import command, read_with_progress, show_summary, with_spinner
+from .app import command, read_recording, show_summary, with_spinner
 from .options import argument, option, output
 
 
@@ -54,7 +54,7 @@ def verify(
     from ..pipeline.verification import verify as run
 
     with together(output):
-        recording = read_with_progress(capture) if capture.suffix == ".toml" else files.load_capture(InputFile(capture))
+        recording = read_recording(capture)
         arm = None if delivered is None else files.load_specification(delivered, base=base, tip=tip)
     checked = with_spinner("Verifying", lambda: run(recording, arm))
     given, measured = arm or recording.as_found, recording.capture

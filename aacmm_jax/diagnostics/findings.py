@@ -248,13 +248,16 @@ def _rank(finding: Finding) -> tuple[bool, float, int]:
 
 
 def warnings_of(
-    result: Calibration | Identification, capture: Capture, *, class_noise: Noise | None = None
+    result: Calibration | Identification | CalibrationRecord,
+    capture: Capture | None = None,
+    *,
+    class_noise: Noise | None = None,
 ) -> list[str]:
     """The sentences of `diagnostics.findings_of`, which the command line prints.
 
     Args:
-        result: What `calibrate` or `identify` returned.
-        capture: What it was calibrated from.
+        result: What `calibrate`, `identify` or `calibrate_capture` returned.
+        capture: What it was calibrated from; not with the record of `calibrate_capture`, which holds it.
         class_noise: Noise that is usual for this class of arms, for a calibration whose noise was estimated.
 
     Returns:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..core.distributions import chi_square_tail, f_tail
 from ..core.linear_algebra import inverse_cholesky
@@ -232,7 +232,9 @@ def form_test(left: Residuals, kernels: Kernels, relative: bool) -> FormTest:
     return FormTest(ratio, probability, t1**2 / max(t2, 1e-300))
 
 
-def alike(columns: Float[np.ndarray, "m r c"], poses: Float[np.ndarray, "m m"]) -> Float[np.ndarray, "1 R R"]:
+def alike(
+    columns: Float[np.ndarray, "m r c"], poses: Float[np.ndarray, "m m"] | Bool[np.ndarray, "m m"]
+) -> Float[np.ndarray, "1 R R"]:
     """The block of shared errors by some columns each, as much as ``poses`` says of each two."""
     flat, rows = columns.reshape(-1, columns.shape[2]), columns.shape[1]
     return (np.kron(poses, np.ones((rows, rows))) * (flat @ flat.T))[None]

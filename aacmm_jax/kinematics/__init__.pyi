@@ -10,6 +10,11 @@ from .collisions import body_along_links as body_along_links
 from .collisions import clearances as clearances
 from .commanded_poses import corrected_targets as corrected_targets
 from .corrected_arm import with_corrections as with_corrections
+from .correction_kinds import AbstractCorrection as AbstractCorrection
+from .correction_kinds import Sought as Sought
+from .correction_kinds import Term as Term
+from .correction_kinds import namespace as namespace
+from .corrections import register_correction as register_correction
 from .inverse_kinematics import corrected_readings as corrected_readings
 from .inverse_kinematics import project_to_targets as project_to_targets
 from .inverse_kinematics import readings_at_poses as readings_at_poses

@@ -15,7 +15,7 @@ from .arm import DOWN, Arm, correction_names, is_single, joint_limits, without_c
 from .beside import ALL
 from .chain import Corrections, Geometry, KnownFunctions, forward_pass, joint_motion, joints_first, of_joints
 from .correction_kinds import KILO, Loads, Term
-from .corrections import term_of, terms_of
+from .corrections import REGISTER, term_of, terms_of
 from .recorded_kinds import Torque
 
 _CONFIGURATIONS = 300
@@ -71,8 +71,7 @@ def with_corrections(
         for name, term in by_name.items():
             if term is None:
                 raise InputError(
-                    f"'{name}' is not the name of a coefficient; give a name such as cos1_2, or a model, or import the "
-                    "module that adds this kind of correction."
+                    f"'{name}' is not the name of a coefficient; give a name such as cos1_2, or a model; or {REGISTER}."
                 )
             if term.takes_masses and term.kind.rows == 3 and loads is None:
                 raise InputError(

@@ -1,7 +1,8 @@
 """What joints do besides their Denavit-Hartenberg motion: the kinds of corrections.
 
 Each coefficient multiplies a known function of the readings (`chain`). A new kind is one class here, added to `KINDS`
-of `corrections`: whatever else the package does with kinds follows from these classes.
+of `corrections`, or one of a user's own (`register_correction`): whatever else the package does with kinds follows from
+these classes.
 """
 
 import abc
@@ -39,7 +40,13 @@ class Loads(NamedTuple):
 
 
 class Sought(NamedTuple):
-    """Functions of a kind that residuals are searched for, all those of one joint at once."""
+    """Functions of a kind that residuals are searched for, all those of one joint at once.
+
+    Example:
+        >>> sought = aj.kinematics.Sought("bow", "", "the square of q_{i}", "a bent scale")
+        >>> print(sought.follows.format(i=2))
+        the square of q_2
+    """
 
     name: str  # what results call it: "first harmonic"
     option: str  # of the model with these functions: "1" of ``harmonics=1``
@@ -52,14 +59,29 @@ class Sought(NamedTuple):
 
 @dataclass(frozen=True)
 class AbstractCorrection(abc.ABC):
-    """A kind of joint correction, without data of its own: every two of a class are equal, and static in a program."""
+    """A kind of joint correction: coefficients, to be calibrated, times known functions of the readings.
 
-    model: ClassVar[str]  # what a model calls it, as in ``--model dh,harmonics=1``
-    words: ClassVar[tuple[str, ...]]  # with which the names of its coefficients begin
+    The sum of these products is added to the angle of a joint, rad, or of a prismatic joint to its position, mm. A
+    kind has no data of its own: every two of a class are equal, and static in a program. A class states `model`,
+    `words`, `description`, `unit`, `usual_size` and `values`; everything else has a default.
+
+    Example:
+        >>> class Bow(aj.kinematics.AbstractCorrection):
+        ...     model, words, description = "bow", ("bow",), "bows of scales"
+        ...     unit, usual_size = "1/rad", 1e-4
+        ...
+        ...     def values(self, terms, q, forward):
+        ...         return q.joints[np.array([term.joint - 1 for term in terms])] ** 2
+        >>> print([term.name for term in Bow().terms(3, "", None)])
+        ['bow_1', 'bow_2', 'bow_3']
+    """
+
+    model: ClassVar[str]  # its name in ``--model dh,harmonics=1``: lowercase letters
+    words: ClassVar[tuple[str, ...]]  # with which the names of its coefficients begin: lowercase letters
     description: ClassVar[str]  # what its coefficients are, in the plural: "errors of gear ratios"
-    unit: ClassVar[str]  # of a coefficient of a revolute joint; in place of rad, mm of a prismatic one
+    unit: ClassVar[str]  # of a revolute joint's coefficient, of 1, rad, mm, m, K and kN; of others mm instead of rad
     unit_alone: ClassVar[str] = ""  # where it differs: of a coefficient whose name has no number
-    usual_size: ClassVar[float]  # about how large coefficients usually are, in this unit
+    usual_size: ClassVar[float]  # about how large coefficients usually are, in this unit: expected by the default prior
     usual_of_slide: ClassVar[float | None] = None  # the same where a joint is prismatic, mm; None: as of others
     rows: ClassVar[int] = 1  # of `values`: 3 for a function of gravity, one for each component of its direction
     of_arm: ClassVar[bool] = False  # whether it scales all lengths of the arm: its terms are of joint 0
@@ -93,12 +115,25 @@ class AbstractCorrection(abc.ABC):
 
     @abc.abstractmethod
     def values(self, terms: Sequence["Term"], q: Readings, forward: ForwardPass) -> Rows:
-        """The functions of terms of this kind, one after the other, `rows` of each: at readings, where the nominal arm
-        has the frames ``forward``, mm."""
+        """The functions of terms of this kind, one after the other, `rows` of each, at N configurations.
+
+        ``q.joints`` are the readings ``(n, ..., 1, N)``, the joints first, rad (mm of prismatic joints); beside them,
+        where they were recorded and else None, are ``q.torques`` and ``q.directions``, of the same shape, and
+        ``q.load``, kg, and ``q.thermometer``, C, ``(1, ..., 1, N)``. ``forward`` has the nominal arm there, mm in the
+        base frame: ``tip``, and by joint ``z_before`` and ``origin_before`` (the axis that moves, and a point on it)
+        and ``origin`` (of the frame after the joint). Arrays are NumPy's or JAX's: functions such as ``cos`` are those
+        of ``aj.kinematics.namespace(q)``.
+        """
 
 
 class Term(NamedTuple):
-    """One coefficient and its function: ``cos2_3`` has the word "cos", the number 2 and the joint 3."""
+    """One coefficient and its function: ``cos2_3`` has the word "cos", the number 2 and the joint 3.
+
+    Example:
+        >>> harmonics = aj.kinematics.with_corrections(arm, ["cos2_3"]).corrections.functions.terms[0].kind
+        >>> print(aj.kinematics.Term(harmonics, "cos", 2, 3).name)
+        cos2_3
+    """
 
     kind: AbstractCorrection
     word: str  # which function

@@ -1,8 +1,10 @@
 """The kinds of joint corrections by name, and their coefficients by name."""
 
+import math
 import re
 from collections.abc import Iterable
 from functools import lru_cache
+from typing import Any, TypeVar
 
 from ..core.errors import InputError, nearest
 from .correction_kinds import AbstractCorrection, Coupling, GearRatio, Gravity, Harmonics, Loads, Sought, Term
@@ -13,11 +15,87 @@ from .recorded_kinds import Backlash, Expansion, Load, Torque
 _SHORT_FORMS = {"functions": "harmonics=1-31"}
 _COEFFICIENT = re.compile(r"([a-z]+)([1-9][0-9]*)?(?:_([1-9][0-9]*))?")
 _KEPT = 4096  # results: every calibration asks for the same ones
+_STATED = ("model", "words", "description", "unit", "usual_size")
+_TAKEN = {"dh", "all", "lengths", "angles", "alpha", "a", "d", "theta", "beta", "probe", "gravity_", *_SHORT_FORMS}
+# Of the units of coefficients; a certificate has to write them in D-SI (`certificate.parameter_results`).
+UNITS = {"1", "rad", "mm", "m", "K", "kN"}
+# What the sentences on unknown names end with.
+REGISTER = (
+    "register a kind of your own first, with aj.kinematics.register_correction, or for aacmm with the environment "
+    "variable AACMM_CORRECTIONS=FILE.py"
+)
+Kind = TypeVar("Kind", bound=AbstractCorrection)
 
 KINDS: dict[str, AbstractCorrection] = {  # by what a model calls them, in the order of these names
     kind.model: kind
     for kind in (Backlash(), Coupling(), Expansion(), GearRatio(), Gravity(), Harmonics(), Load(), Torque())
 }
+
+
+def register_correction(kind: type[Kind]) -> type[Kind]:
+    """Make a joint correction of your own known to models, files, plans, reports and tests of residuals.
+
+    It is a decorator of the class, whose class of the same ``model`` it replaces, so that a cell of a notebook can be
+    run again. Programs that load a calibration with such a correction register it before. For ``aacmm``, the
+    environment variable ``AACMM_CORRECTIONS`` names the Python file with the class.
+
+    Args:
+        kind: A class derived from `AbstractCorrection`, which is made without arguments.
+
+    Returns:
+        The same class.
+
+    Raises:
+        InputError: something that the class must state is missing, or another kind has the same names.
+
+    Example:
+        >>> @aj.kinematics.register_correction
+        ... class Bow(aj.kinematics.AbstractCorrection):
+        ...     model, words, description = "bow", ("bow",), "bows of scales"
+        ...     unit, usual_size = "1/rad", 1e-4
+        ...
+        ...     def values(self, terms, q, forward):
+        ...         return q.joints[np.array([term.joint - 1 for term in terms])] ** 2
+        ...
+        >>> bent = aj.kinematics.with_corrections(arm, "dh,bow")
+        >>> print(aj.kinematics.parameter_names(bent)[-1])
+        bow_6
+    """
+    if wrong := _wrong_kind(kind):
+        raise InputError(wrong)
+    KINDS[kind.model] = kind()
+    coefficient_of.cache_clear()
+    terms_of.cache_clear()
+    return kind
+
+
+def _wrong_kind(kind: Any) -> str:
+    """What is wrong with a class of which a kind is to be made, in one sentence; empty if nothing is."""
+    if not (isinstance(kind, type) and issubclass(kind, AbstractCorrection)):
+        return f"{kind!r} is not a class derived from AbstractCorrection; give such a class."
+    name = kind.__name__
+    missing = [each for each in _STATED if not hasattr(kind, each)] + sorted(kind.__abstractmethods__)
+    if missing:
+        return f"the correction {name} lacks {', '.join(missing)}; add what is missing to the class."
+    stated: Any = kind  # its attributes, of whatever types they are
+    words = stated.words if isinstance(stated.words, tuple) else (stated.words,)
+    others = [other for other in KINDS.values() if other.model != stated.model]
+    if stated.model in KINDS and type(KINDS[stated.model]).__module__.startswith(f"{__package__}."):
+        return f"the package has a correction '{stated.model}'; give {name} another model."
+    for word in (stated.model, *words):
+        if not (isinstance(word, str) and re.fullmatch("[a-z]+", word)):
+            return f"the correction {name} has the name {word!r}; model and words need lowercase letters (a to z) only."
+        if word in _TAKEN or any(word in (other.model, *other.words) for other in others):
+            return f"the correction {name} uses the name '{word}', which means something else; choose another one."
+    if not (words and isinstance(stated.words, tuple)):
+        return f"the words of the correction {name} are {stated.words!r}; give a tuple such as ('{stated.model}',)."
+    for unit in (stated.unit, stated.unit_alone):
+        if not isinstance(unit, str) or not set(re.split(r"[/() ]+", unit)) <= UNITS | {""}:
+            return f"the unit of the correction {name} is {unit!r}; use 1, rad, mm, m, K and kN, as in rad/(kN m)."
+    size = stated.usual_size
+    if not (isinstance(size, int | float) and math.isfinite(size) and size > 0):
+        return f"usual_size of the correction {name} is {size!r}; give the usual size of a coefficient, above 0."
+    return ""
 
 
 @lru_cache(_KEPT)
@@ -88,7 +166,9 @@ def terms_of(model: str, joints: int, loads: Loads | None = None) -> tuple[Term,
             continue
         kind = KINDS.get(name)
         if kind is None:
-            raise InputError(f"unknown model '{name}'{nearest(name, ['dh', *KINDS, *_SHORT_FORMS])}")
+            hint = nearest(name, ["dh", *KINDS, *_SHORT_FORMS])
+            hint = hint if hint.endswith("?") else f"{hint[:-1]}; or {REGISTER}."
+            raise InputError(f"unknown model '{name}'{hint}")
         if option and not kind.has_options:
             raise InputError(f"{name} takes no options, but '{option}' is given; write only {name}.")
         for term in kind.terms(joints, option, loads):

@@ -144,7 +144,7 @@ def default_models(arm: Arm, capture: Capture) -> tuple[str, ...]:
 
 @checked_arguments
 def compare_models(
-    arm: Arm,
+    arm: Arm | ArmSpecification,
     capture: Capture,
     bounds: Bounds | None = None,
     *,
@@ -163,10 +163,12 @@ def compare_models(
     geometry; reference lengths take part in the fits only.
 
     Args:
-        arm: The nominal arm; corrections that it has are replaced by those of each model, except full couplings.
+        arm: The nominal arm, or what its file states (``recording.nominal``), with the bounds that it proposes;
+            corrections that it has are replaced by those of each model, except full couplings.
         capture: Sockets, reference lengths and other observations.
-        bounds: Box of the free Denavit-Hartenberg parameters, mm and rad; by default around those
-            that such data determine. Coefficients of corrections are free in each model that has them.
+        bounds: Box of the free Denavit-Hartenberg parameters, mm and rad; by default that of the arm's file, else 10
+            mm and 1 deg around those that such data determine. Coefficients of corrections are free in each model that
+            has them.
         models: Models from simple to rich, as for `kinematics.with_corrections`; "dh" is the arm alone. The default
             (`default_models`) takes some ten seconds for 500 poses, most of them for "functions" (harmonics=1-31, 62
             coefficients a joint).
@@ -192,6 +194,8 @@ def compare_models(
         >>> print("recommended:", compared.recommended.model)
         recommended: dh
     """
+    if isinstance(arm, ArmSpecification):
+        arm, bounds = arm.arm, arm.bounds() if bounds is None else bounds
     named = default_models(arm, capture) if models is None else items_of(models, "models")
     if not named or not all(isinstance(model, str) and model.strip() for model in named):
         raise InputError(

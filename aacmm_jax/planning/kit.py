@@ -16,6 +16,7 @@ from ..data.observations.observation import AbstractObservation
 from ..data.observations.simulated import AbstractSimulated
 from ..kinematics.arm import Arm
 from ..kinematics.collisions import Cell
+from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import Cone, cones_of, reached
 from ..uncertainty.identifiability import observability
 from .kit_placement import KitItem, Thing, candidates_of_kit, least_poses, place, set_up
@@ -23,6 +24,7 @@ from .motion import Motion, ordered_motion
 from .problem import LOOSE, Criterion, DesignProblem, PlanOptions, Prediction, best_poses, prediction_of, predictions
 
 _CANDIDATES = 2000
+_EVENLY = 60  # candidates in each thing that show what no poses determine
 _RANDOM_SETS, _LOOSE_SETS = 30, 5  # of poses, for predictions
 
 
@@ -55,6 +57,7 @@ class KitPlan(NamedTuple):
     retract: float = 0.0  # distance of approach points, mm
     unconstrained: Prediction | None = None  # in the same places without cones, obstacles and approach points
     heights: tuple[float, float] | None = None  # range of z in which artefacts were placed, mm; None where none were
+    held: tuple[str, ...] = ()  # parameters that no poses with this kit determine, held at their values in the arm
 
     @property
     def poses(self) -> int:
@@ -102,6 +105,7 @@ def plan_kit(arm: Arm, kit: Sequence[KitItem | AbstractSimulated], *, poses: int
         raise InputError("a kit is planned for one chain of a robot; name the chain (chains= or --chain).")
     things = place(problem, items, poses)
     pool = _pool(problem, things)
+    problem, held = _holding(problem, pool)
     least = least_poses(pool)
     if poses < least.sum():
         raise InputError(
@@ -126,6 +130,7 @@ def plan_kit(arm: Arm, kit: Sequence[KitItem | AbstractSimulated], *, poses: int
         cell=problem.region.cell,
         retract=problem.options.retract,
         heights=problem.options.ranges["z"] if any(item.places for item in items) else None,
+        held=held,
     )
     if problem.options.unconstrained:
         free = problem.without_limits()
@@ -163,6 +168,22 @@ def _pool(problem: DesignProblem, things: Sequence[Thing]) -> list[AbstractObser
     """Poses to choose from in everything."""
     starts = (problem.options.candidates or _CANDIDATES) // len(things)
     return [set_up(problem.region, thing, starts, retract=problem.options.retract) for thing in things]
+
+
+def _holding(problem: DesignProblem, pool: Sequence[AbstractObservation]) -> tuple[DesignProblem, tuple[str, ...]]:
+    """The problem without parameters that not even all candidates determine, one of each combination, if such are to be
+    held; and their names."""
+    if not (problem.options.hold_undetermined and any(observation.fixes_scale for observation in pool)):
+        return problem, ()
+    rows = [np.unique(np.linspace(0, len(observation.q) - 1, _EVENLY).astype(int)) for observation in pool]
+    some = Capture({}, (), tuple(observation.select(row) for observation, row in zip(pool, rows, strict=True)))
+    left, held = problem.space, []
+    while (null := observability(problem.arm, some, left).null).shape[1]:
+        held.append(left.names[int(np.argmax(np.abs(null[:, 0])))])
+        left = Parameters(left.base, tuple(name for name in left.names if name not in held))
+    if held:
+        problem = DesignProblem.of(problem.arm, problem.options._replace(space=left))
+    return problem, tuple(held)
 
 
 def _chosen(

@@ -78,6 +78,8 @@ class PlanOptions(NamedTuple):
             of sockets that are placed, also without limits of z.
         candidates: Number of candidate configurations (default: 3000, with a kit 2000).
         check_length: Length that predictions are of, mm (as in `volumetric_uncertainty`).
+        hold_undetermined: Whether parameters that no poses with a kit determine are held at their values in the arm,
+            one of each combination; otherwise they are an error. Without the scale, it is always an error.
         seed: Seed of the search.
         progress: Called with the name of the stage and the fraction of it that is done.
 
@@ -103,6 +105,7 @@ class PlanOptions(NamedTuple):
     unconstrained: bool = False
     candidates: Count | None = None
     check_length: float | None = None
+    hold_undetermined: bool = False
     seed: int = 0
     progress: Callable[[str, float], None] | None = None
 

@@ -214,7 +214,8 @@ def _ratio_axis(ratio: np.ndarray) -> Axis:
     ticks = [tick for tick in steps if tick < 2 * largest]
     values = [-tick for tick in reversed(ticks)] + [-1, 0, 1] + ticks
     low, high = (np.sinh(1.1 * np.arcsinh(end)) for end in (axis.low, axis.high))
-    return Axis(_RATIO, float(low), float(high), tuple((float(at), f"{at:g}") for at in values), "asinh")
+    shown = tuple((float(at), f"{at:g}".replace("-", "−")) for at in values if low <= at <= high)
+    return Axis(_RATIO, float(low), float(high), shown, "asinh")
 
 
 def _within(x: Axis) -> Marks:
@@ -223,4 +224,4 @@ def _within(x: Axis) -> Marks:
 
 def _not_shown(drift: Drift) -> str:
     without = len(drift.names) - drift.reasons.count("")
-    return f"\nnot shown: {pluralise(without, 'change')} without an uncertainty" if without else ""
+    return f";\nnot shown: {pluralise(without, 'change')} without an uncertainty" if without else ""

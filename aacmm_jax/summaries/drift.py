@@ -191,10 +191,10 @@ def _parameters(summary: dict[str, Any]) -> View:
         decimals, small = decimals_for(coarse_u, 5), decimals_for(fine_u, 2)
         old, new = (number(factor * row[which], decimals, rounded=True) for which in ("old", "new"))
         change = number(fine * row["change"], small, signed=True, rounded=True)
-        mark = row["without"] or Cell("* beyond U" if row["moved"] else "", None, "outlier")
-        rows.append((row["parameter"], unit, old, new, small_unit, change, number(fine_u, small), mark))
+        mark = row["without"] or (Cell("* beyond U", None, "outlier") if row["moved"] else "")
+        rows.append((row["parameter"], mark, unit, old, new, small_unit, change, number(fine_u, small)))
     title = f"Parameters: changes, with their expanded uncertainties U ({in_percent(summary['level'])})"
-    yield listed(title, rows, ("parameter", "unit", "old", "new", "unit", "change", "U", ""))
+    yield listed(title, rows, ("parameter", "", "unit", "old", "new", "unit", "change", "U"))
     left_out = len(summary["parameters"]) - len(shown)
     if left_out:
         yield (

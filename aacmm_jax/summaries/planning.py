@@ -9,6 +9,7 @@ import numpy as np
 
 from ..acceptance.procedure import Procedure
 from ..acceptance.standards import STANDARDS
+from ..core.text import listed as listed_words
 from ..core.text import pluralise
 from ..data.noise import linear_encoder_mm
 from ..kinematics.robots import chains_taken
@@ -63,7 +64,7 @@ def kit_plan_summary(plan: KitPlan, arm: str) -> dict[str, Any]:
     owner = np.repeat(np.arange(len(rows)), [row["poses"] for row in rows])
     without = {name: _prediction(u) if np.isfinite(u.largest) else None for name, u in plan.without.items()}
     stated = _stated(plan, arm, plan.motions, [row["observation"] for row in rows], owner)
-    return {"kind": "kit plan", **stated, "observations": rows, "without": without}
+    return {"kind": "kit plan", **stated, "held": list(plan.held), "observations": rows, "without": without}
 
 
 def _stated(
@@ -159,6 +160,9 @@ def kit_plan(summary: dict[str, Any]) -> View:
     """Where artefacts are put, how many poses each gets, and the predicted uncertainty, also without each part."""
     yield from _answer(summary)
     yield [Styled(summary["arm"]), f": {pluralise(summary['poses'], 'pose')}"]
+    if summary["held"]:
+        held = listed_words(summary["held"])
+        yield f"Held at their nominal values, since no poses with this kit determine them: {held}."
     rows = []
     for row in summary["observations"]:
         for i, place in enumerate(row["places"]):

@@ -415,3 +415,15 @@ def test_a_manifest_is_calibrated_as_its_capture_is(aacmm, tmp_path):
     assert (of_capture.pop("written"), of_manifest.pop("written")) == ("plate-calibration.h5", "plate-calibration.h5")
     assert of_capture == of_manifest
     assert aj.files.load_calibration(tmp_path / "plate-calibration.h5").recording.sources
+
+
+@pytest.mark.slow
+def test_a_manifest_is_evaluated_as_the_capture_that_it_makes(aacmm):
+    of_arm = EXAMPLES / "measuring_arm"
+    aacmm("calibrate", of_arm / "session.toml", "-o", "arm.h5", "--model", "dh", "--no-cross-validate")
+    aacmm("import", of_arm / "bar.toml", "-o", "bar.h5")
+    stored, read = (
+        json.loads(aacmm("evaluate", "arm.h5", capture, "--json").stdout) for capture in ("bar.h5", of_arm / "bar.toml")
+    )
+    assert read["held_out"]["sockets"]
+    assert read == stored

@@ -10,6 +10,8 @@ from aacmm_jax.files import save_capture
 from aacmm_jax.kinematics import with_corrections
 from aacmm_jax.kinematics.parameters import ArmSpecification
 
+from ..own_kinds import forgotten_kinds
+
 BOX = [[200, -300, 100], [600, 300, 500]]
 
 
@@ -77,3 +79,49 @@ def test_a_model_has_a_default_prior(aacmm, folder, tmp_path):
     }
     assert (len(rows), rows["cos1_2"]["unit"]) == (36, "rad")
     assert rows["cos1_2"]["value"] == pytest.approx(5e-4, rel=0.2)
+
+
+OWN = """
+from aacmm_jax.kinematics import AbstractCorrection, register_correction
+
+
+@register_correction
+class Bow(AbstractCorrection):
+    model, words, description = "bow", ("bow",), "bows of scales"
+    unit, usual_size = "1/rad", 1e-4
+
+    def values(self, terms, q, forward):
+        return q.joints[[term.joint - 1 for term in terms]] ** 2
+"""
+
+
+def test_a_file_registers_own_corrections(aacmm, tmp_path, monkeypatch):
+    """The model is known where the environment names the file, and only there."""
+    (tmp_path / "bow.py").write_text(OWN)
+    monkeypatch.setenv("AACMM_CORRECTIONS", "bow.py")
+    with forgotten_kinds():
+        assert "did you mean 'bow'?" in aacmm("arm", "cheng2018-simulation", "--model", "dh,bows", expect=2).stderr
+    monkeypatch.delenv("AACMM_CORRECTIONS")
+    refused = aacmm("arm", "cheng2018-simulation", "--model", "dh,bow", expect=2).stderr
+    assert "AACMM_CORRECTIONS=FILE.py" in refused
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (None, "bow.py, the file that AACMM_CORRECTIONS names, cannot be run: FileNotFoundError"),
+        ("1 / 0", "cannot be run: ZeroDivisionError"),
+        ("x =", "cannot be run: SyntaxError"),
+        (
+            OWN.replace(', usual_size = "1/rad", 1e-4', ' = "1/rad"'),
+            "bow.py (AACMM_CORRECTIONS): the correction Bow lacks",
+        ),
+    ],
+)
+def test_a_file_that_does_not_register_is_refused(aacmm, tmp_path, monkeypatch, text, says):
+    if text is not None:
+        (tmp_path / "bow.py").write_text(text)
+    monkeypatch.setenv("AACMM_CORRECTIONS", "bow.py")
+    refused = aacmm("arm", "cheng2018-simulation", expect=2).stderr
+    assert says in refused
+    assert refused.count("\n") == 1

@@ -15,6 +15,16 @@ from aacmm_jax.diagnostics.recorded import of_recording
 from aacmm_jax.kinematics.parameters import ArmSpecification
 
 
+def test_the_record_of_a_calibration_has_its_capture(noisy_capture, paper_arm):
+    recording = aj.Recording(noisy_capture, ArmSpecification(paper_arm))
+    record = aj.calibrate_capture(recording, automatic=False, cross_validate=False, shared_errors=False)
+    said = aj.warnings_of(record)
+    assert said
+    assert said == sentences(findings_of(record))
+    with pytest.raises(aj.InputError, match="does not contain its capture"):
+        aj.warnings_of(aj.calibrate(paper_arm, noisy_capture))
+
+
 def warnings_of(capture, arm, **options):
     """Warnings of a calibration of the paper's arm on a capture."""
     specification = aj.kinematics.ArmSpecification(arm, "test")

@@ -4,6 +4,7 @@ import contextlib
 import os
 import re
 import shlex
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ import matplotlib.pyplot as plt
 import pytest
 
 from ..conftest import command_line
+from ..own_kinds import forgotten_kinds
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -54,9 +56,14 @@ def commands(text: str) -> list[list[str]]:
     return [shlex.split(line[2:], comments=True) for line in lines if line.startswith("$ aacmm")]
 
 
+def variables(text: str) -> list[str]:
+    """The environment variables that a console block sets."""
+    return re.findall(r"^\$ export (\w+=.*)$", text, flags=re.MULTILINE)
+
+
 def outputs(text: str) -> list[re.Pattern[str]]:
     """What a console block shows below each command, a word after the other; ``...`` is any text, or none."""
-    shown = re.split(r"^\$ .*\n", text.replace("\\\n", " "), flags=re.MULTILINE)[1:]
+    shown = re.split(r"^\$ aacmm.*\n", text.replace("\\\n", " "), flags=re.MULTILINE)[1:]
     return [re.compile(".*".join(re.escape(" ".join(x.split())) for x in part.split("..."))) for part in shown]
 
 
@@ -74,6 +81,13 @@ def test_snippets_run(page, tmp_path, monkeypatch):
         (tmp_path / extra.name).write_bytes(extra.read_bytes())
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(os.environ, "MPLBACKEND", "agg")
+    monkeypatch.syspath_prepend(tmp_path)
+    with forgotten_kinds(), forgotten_modules(tmp_path):
+        run_snippets(page, tmp_path, monkeypatch)
+    plt.close("all")
+
+
+def run_snippets(page, tmp_path, monkeypatch):
     namespace: dict[str, object] = {"__name__": page}
     for number, (language, text, file) in enumerate(snippets(page), start=1):
         if file is not None:
@@ -85,10 +99,20 @@ def test_snippets_run(page, tmp_path, monkeypatch):
             with contextlib.redirect_stdout(None):
                 exec(compile(text, f"{page}, block {number}", "exec"), namespace)
         else:
+            for variable in variables(text):
+                monkeypatch.setenv(*variable.split("=", 1))
             for command, output in zip(commands(text), outputs(text), strict=True):
                 printed = " ".join(command_line(tmp_path, *command[1:]).stdout.split())
                 assert page not in COMPARED or output.search(printed), (output.pattern, printed)
-    plt.close("all")
+
+
+@contextlib.contextmanager
+def forgotten_modules(folder):
+    """Modules that a page writes, and imports, are not those of another page."""
+    yield
+    for name, module in list(sys.modules.items()):
+        if Path(getattr(module, "__file__", None) or "/").parent == folder:
+            del sys.modules[name]
 
 
 def test_blocks_are_found(tmp_path, monkeypatch):

@@ -16,6 +16,8 @@ DOCS = Path(__file__).resolve().parents[2] / "docs"
 sys.path.insert(0, str(DOCS / "extensions"))
 from public_names import namespaces, public_names  # noqa: E402
 
+from ..own_kinds import forgotten_kinds  # noqa: E402
+
 NAMES = {item.name.replace("aacmm_jax", "aj", 1): item for item in public_names()}
 # What the examples use, and what those of studies use besides.
 SETUP, STUDY_SETUP = re.findall(r"```python\n(.*?)```", (DOCS / "reference" / "index.md").read_text(), flags=re.DOTALL)
@@ -131,7 +133,7 @@ def test_example_runs(name, namespace, request, tmp_path, monkeypatch):
     report: list[str] = []
     test = doctest.DocTest(examples, dict(namespace), name, str(NAMES[name].source), 0, None)
     # As readers have it: the tests forbid a sum of a matrix and a row.
-    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"), forgotten_kinds():
         found = doctest.DocTestRunner(optionflags=OPTIONS, verbose=False).run(test, out=report.append)
     plt.close("all")
     assert not found.failed, "".join(report)

@@ -45,6 +45,9 @@ QUERIES = {
     "hand-eye": "how_to/cameras",
     "focal length": "troubleshooting",
     "command not found": "troubleshooting",
+    "own joint model": "how_to/own_joint_model",
+    "custom correction": "how_to/own_joint_model",
+    "new model": "how_to/own_joint_model",
 }
 READ_BY_ALL = (
     "index",

@@ -1,9 +1,13 @@
 """A new kind of joint correction is one class: this one goes the whole way, and the package has never heard of it."""
 
+import re
 from typing import ClassVar
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import TypeCheckError
 
 import aacmm_jax as aj
 from aacmm_jax.certificate.parameter_results import in_d_si
@@ -12,12 +16,13 @@ from aacmm_jax.cli.display import display
 from aacmm_jax.diagnostics.model_errors import model_tests
 from aacmm_jax.diagnostics.shared_errors import missing_functions
 from aacmm_jax.files.arm_tables import prior_of_text, with_model
+from aacmm_jax.kinematics import AbstractCorrection, Sought, default_prior, register_correction, with_corrections
 from aacmm_jax.kinematics import corrections as kinds
-from aacmm_jax.kinematics import default_prior, with_corrections
 from aacmm_jax.kinematics.arm import correction_names
-from aacmm_jax.kinematics.correction_kinds import AbstractCorrection, Sought
 from aacmm_jax.report import write_report
 from aacmm_jax.summaries.calibration import arm_summary
+
+from ..own_kinds import forgotten_kinds
 
 BOW = 2e-4  # 1/rad
 
@@ -40,15 +45,9 @@ class Bow(AbstractCorrection):
 
 @pytest.fixture(scope="module", autouse=True)
 def bow():
-    def forget():
-        kinds.coefficient_of.cache_clear()
-        kinds.terms_of.cache_clear()
-
-    kinds.KINDS["bow"] = Bow()
-    forget()
-    yield
-    del kinds.KINDS["bow"]
-    forget()
+    with forgotten_kinds():
+        register_correction(Bow)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +104,11 @@ def test_it_is_among_what_poses_may_share(paper_arm):
 @pytest.mark.slow
 def test_it_is_stored_and_reported(record, tmp_path):
     aj.files.save_calibration(tmp_path / "bent.h5", record)
+    with forgotten_kinds():
+        del kinds.KINDS["bow"]
+        kinds.coefficient_of.cache_clear()
+        with pytest.raises(aj.InputError, match=r"'bow_2' is not .*; or register a kind of your own first"):
+            aj.files.load_calibration(tmp_path / "bent.h5")
     again = aj.files.load_calibration(tmp_path / "bent.h5")
     assert again.names == record.names
     assert correction_names(again.calibrated.arm) == ("bow_2",)
@@ -139,6 +143,56 @@ def test_the_arm_is_shown_with_it(capsys):
 @pytest.mark.exhaustive
 def test_the_command_line_takes_it(aacmm):
     assert "bows of scales" in " ".join(aacmm("arm", "cheng2018-simulation", "--model", "dh,bow").stdout.split())
+
+
+def test_a_class_of_the_same_model_takes_its_place(paper_arm):
+    """As where a cell of a notebook is run again; derivatives are those of the new functions."""
+    bent = with_corrections(paper_arm, ["bow_2"]).replace(bow_2=BOW)
+    q, tip = jnp.full(6, 0.5), jax.jit(lambda arm, q: arm.position(q))
+    before = tip(bent, q)
+
+    class Cubic(Bow):
+        def values(self, terms, q, forward):
+            return q.joints[np.array([term.joint - 1 for term in terms])] ** 3
+
+    with forgotten_kinds():
+        register_correction(Cubic)
+        again = with_corrections(paper_arm, ["bow_2"]).replace(bow_2=2 * BOW)
+        np.testing.assert_allclose(tip(bent, q), before, atol=1e-12)
+        np.testing.assert_allclose(tip(again, q), before, atol=1e-12)  # 0.5^2 BOW = 0.5^3 2 BOW
+        assert not np.allclose(tip(again, 2 * q), tip(bent, 2 * q), atol=1e-6)
+
+
+WRONG = {
+    "lacks usual_size, values": {"usual_size": None, "values": None},
+    "the package has a correction 'gear'": {"model": "gear"},
+    "uses the name 'cos'": {"words": ("cos",)},
+    "uses the name 'theta'": {"words": ("theta",)},
+    "uses the name 'all'": {"model": "all"},
+    "has the name 'my_bow'": {"model": "my_bow"},
+    "give a tuple such as ('arch',)": {"words": "arch"},
+    "the unit of the correction Own is 'mrad'": {"unit": "mrad"},
+    "usual_size of the correction Own is 0": {"usual_size": 0},
+}
+
+
+@pytest.mark.parametrize("says", WRONG)
+def test_what_a_class_lacks_is_said(says):
+    stated = {"model": "arch", "words": ("arch",), "description": "arches", "unit": "rad", "usual_size": 1e-4}
+    stated |= {"values": Bow.values} | WRONG[says]
+    kind = type("Own", (AbstractCorrection,), {name: value for name, value in stated.items() if value is not None})
+    with pytest.raises(aj.InputError, match=re.escape(says)):
+        register_correction(kind)
+    assert "arch" not in kinds.KINDS
+
+
+def test_what_is_registered_is_a_class():
+    with pytest.raises((aj.InputError, TypeCheckError), match=r"Bow\(\)"):  # the latter where types are checked
+        register_correction(Bow())  # pyright: ignore[reportArgumentType]
+
+
+def test_certificates_know_every_unit():
+    assert all(in_d_si(unit) for unit in kinds.UNITS)
 
 
 @pytest.mark.parametrize(

@@ -203,6 +203,19 @@ def test_a_model_that_predicts_worse_is_not_taken_by_default(monkeypatch, paper_
     chosen = automatic.with_best_model(record, lambda part: result, recorded, options)
     assert (chosen is not record) == taken
     assert any("Model of the joints: gravity" in says for says in chosen.decisions) == taken
+    assert any("2 % smaller" in says for says in chosen.decisions) == (outside < 0.985)
+
+
+@pytest.mark.slow
+def test_the_bounds_of_a_file_are_those_of_its_models(paper_arm):
+    """Without them, a parameter that is far off ends on a bound."""
+    true = paper_arm.replace(theta_3=float(paper_arm.theta[2]) + 0.02)
+    places = {"A": (400, 200, 300), "B": (500, 300, 100), "C": (300, -300, 300), "D": (450, 0, 400)}
+    capture = aj.simulate(true, places, poses=14, lengths=[("A", "B", 0.002)], noise=NOISE, seed=2)
+    stated = compare_models(ArmSpecification(paper_arm, angle=0.05), capture, models=["dh"])
+    around = compare_models(paper_arm, capture, models=["dh"])
+    assert stated.models[0].result.active_names() == {}
+    assert "theta_3" in around.models[0].result.active_names()
 
 
 @pytest.mark.slow

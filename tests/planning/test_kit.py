@@ -234,3 +234,20 @@ def test_a_kit_that_leaves_parameters_open(paper_arm):
             candidates=100,
             check_length=200.0,
         )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("thing", "names", "held"),
+    [(EVERYTHING[3], ("d_1", "a_2"), ("d_1",)), (EVERYTHING[1], ("d_1", "a_2"), ("d_1",)), (EVERYTHING[1], FEW, ())],
+    ids=["sphere", "tracker", "tracker, nothing open"],
+)
+def test_what_a_kit_leaves_open_is_held_if_asked(paper_arm, thing, names, held):
+    """Neither a sphere nor a tracker that stands anywhere says at which height the arm stands."""
+    given = {"poses": 12, "candidates": 100, "check_length": 200.0, "hold_undetermined": True}
+    planned = plan_kit(paper_arm, [thing], space=aj.Parameters(paper_arm, names), **given)
+    assert planned.held == held
+    assert {*planned.names} == {*names} - {*held}
+    assert np.isfinite(planned.predicted.largest)
+    seen = aj.observability(paper_arm, planned.capture(), aj.Parameters(paper_arm, planned.names))
+    assert seen.rank == len(planned.names)

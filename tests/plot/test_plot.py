@@ -7,6 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import aacmm_jax as aj
+from aacmm_jax.plot.drift import _ratio_axis
 from tests.refusals import assert_refused
 from tests.written_study import write_study
 
@@ -184,3 +185,12 @@ def test_errors_before_and_after_the_scale_fix_stand_side_by_side(made):
     medians = [1e6 * (np.median(results.column("scale", cell)) - 1) for cell in (0, 1)]
     scale = aj.plot.study_scale(results, "noise.encoder_arcsec").axes[0]
     np.testing.assert_allclose(scale.containers[0].lines[0].get_ydata(), medians, rtol=1e-6)
+
+
+@pytest.mark.parametrize("ratio", [[0.2, -0.4], [1.2, -12.0], [30.0, 0.1], [-300.0, 0.3], [5e4, -2.0]])
+def test_ratios_are_labelled_within_their_axis(ratio):
+    """Labels beyond the ends of an axis would lie over the title."""
+    axis = _ratio_axis(np.array(ratio))
+    assert axis.low <= min(ratio) < max(ratio) <= axis.high
+    assert all(axis.low <= at <= axis.high for at, _ in axis.ticks)
+    assert {-1.0, 0.0, 1.0} <= {at for at, _ in axis.ticks}
