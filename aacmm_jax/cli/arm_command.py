@@ -63,7 +63,7 @@ def arm(
     ),
     as_json: bool = options.JSON,
 ) -> None:
-    """Analyse an arm before its first calibration; without an arm, list those that ship with aacmm.
+    """Analyse an arm before its first calibration.
 
     The command prints the axes with all readings zero, the reach of the arm, the redundant parameters, the number of
     parameters that sockets, reference lengths and a tracker determine, and the number of poses that a first capture
@@ -89,11 +89,10 @@ def arm(
         show_summary(summary, as_json, lambda shown: [f"Written: {shown['written']}. View this arm: aacmm arm {new}"])
         return
     if file is None:
-        if any(stated is not None for stated in (joints, check, unit, figure, model)):
-            raise InputError("no arm is given; name an arm file or a shipped arm ('aacmm arm' lists them).")
-        arms = [{"name": name, "arm": files.load_specification(name).name} for name in files.shipped_arms()]
-        show_summary({"kind": "shipped arms", "arms": arms}, as_json, shipped)
-        return
+        raise InputError(
+            "no arm is given; name an arm file, write a template with --new my-arm.toml, or name a shipped arm: "
+            f"{', '.join(files.shipped_arms())}."
+        )
     if joints is not None:
         raise InputError("--joints applies to a template only; give --new too.")
     options.check_figure(figure)
@@ -124,12 +123,6 @@ def arm(
             plot.save_arm_figure(specification.arm, figure, title=specification.name, base=frame)
             summary["written"] = str(figure)
     show_summary(summary, as_json, survey)
-
-
-def shipped(summary: dict[str, Any]) -> View:
-    """The arms that ship with the package."""
-    yield listed("Arms that ship with aacmm", summary["arms"], {"name": "name", "arm": "arm"})
-    yield "Analyse one of them: aacmm arm NAME. Describe another one: aacmm arm --new my-arm.toml, or give its URDF."
 
 
 def first_frame(specification: Any) -> Any:

@@ -428,14 +428,14 @@ def correct(
             found = found if own is None else own.of_robot(found)
             text = corrected_csv(commanded, found, np.asarray(corrected.reached))
         summary = summaries.correction.correction_summary(
-            nominal, calibrated, q, corrected, unit=commanded.unit, of_readings=commanded.poses is None
+            nominal,
+            calibrated,
+            q,
+            corrected,
+            unit=commanded.unit,
+            of_readings=commanded.poses is None,
+            recorded=np.asarray(record.recording.capture.readings),
         )
-        if own is None:
-            recorded = np.asarray(record.recording.capture.readings)[:, : nominal.joints]
-            reached = np.asarray(corrected.reached)
-            summary["warnings"] += summaries.correction.outside_recorded(
-                nominal, recorded, np.asarray(corrected.q)[:, : nominal.joints], reached
-            )
         tip = slice(None) if own is None else slice(3 * own.number, 3 * own.number + 3)
         summary["probe_mm"] = [np.asarray(arm.probe)[tip].tolist() for arm in (nominal, calibrated)]
         if probe is None and (commanded.poses is not None or summary["position_only"]):

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import aacmm_jax as aj
 from aacmm_jax.cli.commanded import in_first_frame
 from aacmm_jax.kinematics.inverse_kinematics import corrected_readings
-from aacmm_jax.summaries.correction import correction_summary, outside_recorded
+from aacmm_jax.summaries.correction import correction_summary
 
 from ..conftest import command_line
 
@@ -201,16 +201,6 @@ def test_positions_are_of_the_tip_or_of_a_target_by_its_name(tmp_path):
     assert "a target of the calibration (ball)" in " ".join(said.split())
 
 
-def test_rows_outside_the_range_of_the_calibration_are_named():
-    """Within a tenth of the range and a degree, nothing is said; nor of rows that are not reached."""
-    nominal, recorded = aj.load_arm("ur10e"), np.radians([np.zeros(6), np.full(6, 10)])
-    q = np.radians(np.array([[0, 5, 10, 5, 5, 5], [11.9] * 6, [12.1, 5, 5, 5, -2.1, 5], [90] * 6]))
-    (said,) = outside_recorded(nominal, recorded, q, np.array([True, True, True, False]))
-    assert said.startswith("In 1 row (row 3) joints are outside the range")
-    assert "(joint 1: 0 to 10 deg, joint 5: 0 to 10 deg)" in said
-    assert outside_recorded(nominal, recorded, q[:2], np.ones(2, dtype=bool)) == []
-
-
 def test_rows_at_a_singular_wrist_are_named():
     """Axes 4 and 6 of a UR10e align where joint 5 is at 0"""
     nominal = aj.load_arm("ur10e")
@@ -220,6 +210,21 @@ def test_rows_at_a_singular_wrist_are_named():
     summary = correction_summary(nominal, nominal, q, found, unit="rad", of_readings=True)
     assert summary["singular"] == [2]
     assert summary["warnings"][0].startswith("In 1 row (row 2) the nominal arm is at a singularity")
+
+
+def test_rows_outside_the_recorded_poses_are_named():
+    """Beyond 5 deg of their range, whole revolutions aside; what is not reached is named already."""
+    nominal = aj.load_arm("ur10e")
+    recorded = np.array([[0.2, -1.6, 1.0, 0.2, 0.7, -0.3], [0.4, -0.6, 1.4, 0.6, 1.3, 0.3]])
+    q = np.tile(recorded.mean(axis=0), (4, 1))
+    q[1, 2] += 0.2 + 20 * DEG
+    q[2, 2] += 0.2 + 4 * DEG
+    q[3, 0] -= 2 * np.pi
+    found = corrected_readings(nominal, nominal.replace(d_6=nominal.d[5] + 0.01), q)
+    about = {"unit": "rad", "of_readings": True}
+    (said,) = correction_summary(nominal, nominal, q, found, recorded=recorded, **about)["warnings"]
+    assert said.startswith("In 1 row (row 2) the arm is outside the poses of the calibration (joint 3 by up to 20 deg)")
+    assert correction_summary(nominal, nominal, q, found, recorded=q, **about)["warnings"] == []
 
 
 def test_poses_of_a_urdf_are_in_its_base_link():
