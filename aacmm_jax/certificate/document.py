@@ -13,6 +13,7 @@ from ..core.errors import InputError
 from ..diagnostics.contradictions import LEFT_OUT
 from ..diagnostics.findings import findings_of
 from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity
+from ..summaries.calibration import calibration_summary
 from ..summaries.observations import scale_sources
 from ..uncertainty.coverage import COVERAGE_FACTOR
 from . import xml_elements as xml
@@ -196,6 +197,9 @@ def _statements(
         traceable = "the certified values of these artefacts and the measuring instruments"
     says = f"The scale of the arm comes from {scale}. Measurements of the arm are traceable to the metre"
     yield _statement("Scale", f"{says} only to the extent that {traceable} are traceable.")
+    verdict = calibration_summary(record)["verdict"]
+    if verdict["mark"] in ("unsure", "bad"):
+        yield _statement("Not usable" if verdict["mark"] == "bad" else "To be used with care", verdict["says"])
     yield _statement("Uncertainty", uncertainty_statement(record), norm="JCGM 100:2008")
     if record.sampled_says:
         yield _statement("Monte Carlo", record.sampled_says, norm="JCGM 101:2008")

@@ -1,6 +1,7 @@
 """The measurement results of a certificate: the same readings by the nominal and by the calibrated parameters."""
 
 import contextlib
+import fnmatch
 import itertools
 import math
 from collections.abc import Iterator, Sequence
@@ -14,6 +15,7 @@ from ..calibration.evaluation import Evaluation
 from ..calibration.pose_table import HELD_OUT
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.errors import InputError
+from ..core.text import shorten
 from ..data.capture import ReferenceLength
 from ..data.observations.observation import Quantity, certified_quantities
 from ..data.observations.pixels import Pixels
@@ -86,7 +88,7 @@ def results_of(
             title,
             _methods(record, residuals),
             xml.software("usedSoftware", command),
-            element("measuringEquipments", _equipment(record, given.reference, residuals)),
+            element("measuringEquipments", _equipment(record, given.reference, residuals, evaluation)),
             element("influenceConditions", named("influenceCondition", "Ambient temperature", status, data)),
             element("results", _results(record, stage, residuals, evaluation)),
             says=says,
@@ -156,22 +158,26 @@ def _methods(record: CalibrationRecord, residuals: tuple[ObservationResiduals, .
 
 
 def _equipment(
-    record: CalibrationRecord, references: Sequence[Reference], residuals: tuple[ObservationResiduals, ...]
+    record: CalibrationRecord,
+    references: Sequence[Reference],
+    residuals: tuple[ObservationResiduals, ...],
+    evaluation: EvaluationRecord | None,
 ) -> Iterator[Element]:
-    """The reference artefacts, the reference lengths, and the artefacts and instruments behind observations, with
-    certified values and uncertainties as they were given."""
+    """The reference artefacts with their lengths, the lengths of none, and the artefacts and instruments behind
+    observations, with certified values and uncertainties as they were given."""
+    lengths, assigned = _certified_lengths(record, evaluation), set()
     for reference in references:
         serial = ("manufacturer", reference.serial_number, "Serial number")
         certificate = ("other", reference.certificate_number, "Number of its calibration certificate")
-        yield xml.item("measuringEquipment", reference.name, reference, serial, certificate)
-    if lengths := record.recording.capture.lengths:
-        quantities = (
-            xml.equipment_quantity(_length_name(i, length), float(length.value), MILLIMETRE, float(length.u))
-            for i, length in enumerate(lengths, start=1)
-        )
+        artefact = xml.item("measuringEquipment", reference.name, reference, serial, certificate)
+        if names := _lengths_of(reference, lengths):
+            artefact.append(_quantities(lengths, names))
+            assigned.update(names)
+        yield artefact
+    fitted = itertools.islice(lengths, len(record.recording.capture.lengths))
+    if others := [name for name in fitted if name not in assigned]:
         unknown = "" if references else f"Artefact: {NOT_STATED}"
-        quantities = element("measuringEquipmentQuantities", quantities)
-        yield named("measuringEquipment", "Reference lengths", quantities, says=unknown)
+        yield named("measuringEquipment", "Reference lengths", _quantities(lengths, others), says=unknown)
     # Observations with the same certified values are of one artefact in several placements, which is named once.
     equipment: dict[tuple, tuple[list[str], str, list[Quantity]]] = {}
     for part in residuals:
@@ -200,6 +206,40 @@ def _equipment(
             english("description", f"Kind of observation: {kind}{unknown}"),
             element("measuringEquipmentQuantities", numbers),
         )
+
+
+def _certified_lengths(record: CalibrationRecord, evaluation: EvaluationRecord | None) -> dict[str, ReferenceLength]:
+    """The lengths of the calibration, then those of the evaluation, by their names in the certificate."""
+    lengths: list[tuple[str, Sequence[ReferenceLength]]] = [("", record.recording.capture.lengths)]
+    if evaluation is not None:
+        tested = evaluation.recording.capture.lengths
+        lengths.append(("Test ", [tested[i] for i in evaluation.held_out_lengths()]))
+    return {f"{of}{_length_name(i, x)}": x for of, rows in lengths for i, x in enumerate(rows, start=1)}
+
+
+def _lengths_of(reference: Reference, lengths: dict[str, ReferenceLength]) -> list[str]:
+    """The names of the lengths that a reference stands for; `InputError` if it names one that there is not."""
+    names = {name: f"{length.start} - {length.end}" for name, length in lengths.items()}
+    chosen = {}
+    for pattern in reference.lengths:
+        matches = [key for key, name in names.items() if name == pattern or fnmatch.fnmatchcase(name, pattern)]
+        if not matches:
+            there = (
+                f"lengths are {shorten(list(dict.fromkeys(names.values())), 6)}" if names else "there are no lengths"
+            )
+            raise InputError(
+                f"the reference '{reference.name}' has the length '{pattern}', which is not one of the calibration or "
+                f"the evaluation ({there}); correct reference.lengths, or give the evaluation with --evaluation."
+            )
+        chosen |= dict.fromkeys(matches)
+    return list(chosen)
+
+
+def _quantities(lengths: dict[str, ReferenceLength], names: Sequence[str]) -> Element:
+    values = ((name, float(lengths[name].value), float(lengths[name].u)) for name in names)
+    return element(
+        "measuringEquipmentQuantities", (xml.equipment_quantity(name, x, MILLIMETRE, u) for name, x, u in values)
+    )
 
 
 def _size(seen: Pixels) -> Quantity:
@@ -259,7 +299,7 @@ def _held_out(record: CalibrationRecord, evaluation: EvaluationRecord | None) ->
     row = distances_row(residuals_of(source).used_as(HELD_OUT))
     values = [("poses", row["poses"], ONE), *((name, row[key], MILLIMETRE) for key, name in _HELD_OUT.items())]
     quantities = (
-        named("quantity", name, real(value, unit, decimals=0 if unit == ONE else _DECIMALS[unit]))
+        named("quantity", name, real(value, unit, decimals=0 if unit == ONE else 6))  # printed to three digits
         for name, value, unit in values
         if value is not None
     )

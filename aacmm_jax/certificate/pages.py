@@ -17,6 +17,10 @@ from .results_page import results_page
 from .sections import MOST_ROWS, Section, content, first, identification, more, with_u
 from .xml_elements import PREFIXES, root_of
 
+_BANNERS = {"Simulation": "simulated", "Not usable": "not_usable"}
+_RESERVATIONS = {"Not usable": "not_usable_sentence", "To be used with care": "with_care_sentence"}
+_OF_LENGTH = re.compile(r"(?P<test>Test )?\d+: (?P<name>.*)", flags=re.DOTALL)  # the name of a length in the DCC
+
 
 class Pages(NamedTuple):
     """What both pages say."""
@@ -57,7 +61,7 @@ def pages_of(dcc: str, words: Language) -> Pages:
         ],
         title=words("title"),
         number=core.findtext("dcc:uniqueIdentifier", "", PREFIXES),
-        banner=words("simulated") if "Simulation" in statements else "",
+        banner=" ".join(words(key) for name, key in _BANNERS.items() if name in statements),
         pages=(
             list(_first_page(administrative, core, results, statements, words)),
             list(results_page(results, statements, words)),
@@ -112,14 +116,22 @@ def _first_page(
     celsius = words("not_stated") if condition is None else with_u(condition, words)
     yield Section(words("conditions"), [(words("temperature"), celsius)])
     headings = "artefact", "manufacturer", "serial_number", "certificate_number", "certified"
+    table = [_equipment(x, words) for x in after.iterfind("dcc:measuringEquipments/*", PREFIXES)]
+    stated = [i for i in range(len(headings)) if i in (0, len(headings) - 1) or any(row[i] for row in table)]
     yield Section(
         words("traceability"),
         paragraphs=[words("traceability_sentence")],
-        headings=[words(key) for key in headings],
-        table=[_equipment(x, words) for x in after.iterfind("dcc:measuringEquipments/*", PREFIXES)][:MOST_ROWS],
-        texts=len(headings),
+        headings=[words(headings[i]) for i in stated],
+        table=[[row[i] or "–" for i in stated] for row in table[:MOST_ROWS]],
+        texts=len(stated),
+        notes=more(len(table) - MOST_ROWS, words),
     )
-    yield Section(words("uncertainty"), paragraphs=[words("uncertainty_sentence")])
+    reservations = [
+        content(statement, "dcc:declaration") if words.code == "en" else words(key)
+        for name, key in _RESERVATIONS.items()
+        for statement in statements.get(name, ())
+    ]
+    yield Section(words("uncertainty"), paragraphs=[words("uncertainty_sentence"), *reservations])
     remarks = [content(statement, "dcc:declaration") for statement in statements.get("Remarks", ())]
     general = [words(f"{key}_sentence") for key in ("item", "attached", "copies")]
     yield Section(words("remarks"), paragraphs=[*remarks, " ".join(general)])
@@ -142,12 +154,18 @@ def _first_page(
 def _equipment(equipment: Element, words: Language) -> list[str]:
     name = content(equipment, "dcc:name")
     quantities = equipment.findall("dcc:measuringEquipmentQuantities/*", PREFIXES)
-    values = "; ".join(with_u(quantity, words) for quantity in quantities[:3])
+    values: dict[str, list[str]] = {}  # names of lengths by what is certified of them
+    for quantity in quantities:
+        length = _OF_LENGTH.fullmatch(content(quantity, "dcc:name"))
+        value = with_u(quantity, words)
+        value = f"{words('test')}: {value}" if length and length["test"] else value
+        values.setdefault(value, []).append(length["name"] if length else "")
+    texts = [f"{names[0]}:\u00a0{value}" if len(names) == 1 and names[0] else value for value, names in values.items()]
     maker = content(equipment, "dcc:manufacturer/dcc:name"), equipment.findtext("dcc:model", "", PREFIXES)
     return [
         words.known(name, name),
         ", ".join(filter(None, maker)),
         identification(equipment, "Serial number"),
         identification(equipment, "Number of its calibration certificate"),
-        "; ".join([values, *more(len(quantities) - 3, words)]),
+        "; ".join([*texts[:3], *more(len(texts) - 3, words)]),
     ]

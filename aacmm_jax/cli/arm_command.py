@@ -90,7 +90,8 @@ def arm(
         return
     if file is None:
         raise InputError(
-            "no arm is given; name an arm file or a shipped arm, or write a template with --new my-arm.toml."
+            "no arm is given; name an arm file, write a template with --new my-arm.toml, or name a shipped arm: "
+            f"{', '.join(files.shipped_arms())}."
         )
     if joints is not None:
         raise InputError("--joints applies to a template only; give --new too.")

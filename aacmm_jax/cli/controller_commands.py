@@ -428,7 +428,13 @@ def correct(
             found = found if own is None else own.of_robot(found)
             text = corrected_csv(commanded, found, np.asarray(corrected.reached))
         summary = summaries.correction.correction_summary(
-            nominal, calibrated, q, corrected, unit=commanded.unit, of_readings=commanded.poses is None
+            nominal,
+            calibrated,
+            q,
+            corrected,
+            unit=commanded.unit,
+            of_readings=commanded.poses is None,
+            recorded=np.asarray(record.recording.capture.readings),
         )
         tip = slice(None) if own is None else slice(3 * own.number, 3 * own.number + 3)
         summary["probe_mm"] = [np.asarray(arm.probe)[tip].tolist() for arm in (nominal, calibrated)]

@@ -12,7 +12,8 @@ from ..data.observations.measured import MeasuredPoints
 from ..kinematics.arm import Arm
 from ..kinematics.corrections import coefficient_of
 from ..kinematics.robots import chains_of
-from .camera_points import with_points_of_cameras
+from .camera_points import axes_of_cameras, with_points_of_cameras
+from .hand_eye_search import hand_eye_hypotheses
 from .reading_check import EXPLAINED, NEVER, ReadingCheck, checked_fit, possible_units, reading_fit
 from .reading_fit import ReadingFit
 from .reading_search import Hypothesis
@@ -30,7 +31,7 @@ def check_capture(arm: Arm, capture: Capture) -> ReadingCheck:
         checks = [check_capture(*part) for part in _by_chain(arm, capture)]
         return next((check for check in checks if not check.explained), checks[0])
     fit = reading_fit(arm, **_evidence_of(arm, capture))
-    check = checked_fit(fit)
+    check = checked_fit(fit, _by_cameras(fit, capture))
     return check if check.explained else _with_couplings(check, fit)
 
 
@@ -70,6 +71,17 @@ def _evidence_of(arm: Arm, capture: Capture) -> dict[str, Any]:
     """The arguments of `check_readings` for a capture."""
     if any(size > 1 for size in capture.sizes):
         return {"q": np.asarray(capture.q)[:, : arm.joints], "sockets": capture.owner}
+    seen = _seen(capture)
+    return {
+        "q": np.concatenate([np.asarray(part.q)[:, : arm.joints] for part in seen]),
+        "positions": np.concatenate([np.asarray(part.points) for part in seen]),
+        "own_frame": True,
+        "free_tip": bool(seen[0].target),
+    }
+
+
+def _seen(capture: Capture) -> list[MeasuredPoints]:
+    """What one station measured of one target, as points."""
     parts = with_points_of_cameras(capture).observations
     measured = [observation for observation in parts if isinstance(observation, MeasuredPoints)]
     if not measured:
@@ -78,13 +90,19 @@ def _evidence_of(arm: Arm, capture: Capture) -> dict[str, Any]:
             "the capture has none of these."
         )
     station, target = measured[0].station, measured[0].target
-    seen = [part for part in measured if (part.station, part.target) == (station, target)]
-    return {
-        "q": np.concatenate([np.asarray(part.q)[:, : arm.joints] for part in seen]),
-        "positions": np.concatenate([np.asarray(part.points) for part in seen]),
-        "own_frame": True,
-        "free_tip": bool(target),
-    }
+    return [part for part in measured if (part.station, part.target) == (station, target)]
+
+
+def _by_cameras(fit: ReadingFit, capture: Capture) -> list[Hypothesis]:
+    """Signs and zeros that the orientations of a camera or its target show."""
+    if any(size > 1 for size in capture.sizes):
+        return []
+    axes = axes_of_cameras(capture, {part.name for part in _seen(capture)})
+    q, points = fit.evidence.q, fit.evidence.points
+    # Numbers too large for rad are degrees, which the search of all orders finds.
+    if axes is None or points is None or np.abs(q).max() > NEVER:
+        return []
+    return hand_eye_hypotheses(fit.arm, q, points, axes, fit.size)
 
 
 def search_couplings(arm: Arm, capture: Capture) -> dict[str, float]:

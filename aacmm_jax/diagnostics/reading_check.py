@@ -148,11 +148,11 @@ def reading_fit(
     return ReadingFit(arm, evidence, max(total_link_length(arm), 1e-9), free_tip)
 
 
-def checked_fit(fit: ReadingFit) -> ReadingCheck:
-    """The hypotheses that the search finds, refitted and compared."""
+def checked_fit(fit: ReadingFit, likely: Sequence[Hypothesis] = ()) -> ReadingCheck:
+    """The hypotheses that the search finds, and others that are likely, refitted and compared."""
     arm, evidence, n = fit.arm, fit.evidence, fit.arm.joints
     given = fit.explanation(Hypothesis(tuple(range(n)), (1,) * n, (0.0,) * n))
-    candidates, tried = [], 0
+    candidates, tried = [([hypothesis], *fit.with_free_zeros(hypothesis)) for hypothesis in likely], 0
     for angle, length in possible_units(fit):
         rms, hypotheses, count = search(arm, evidence.scaled(angle, length).thinned(), fit.lever)
         tried += count

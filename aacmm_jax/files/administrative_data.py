@@ -106,6 +106,7 @@ class Reference(Strict):
     model: Text | None = None
     serial_number: Text | None = None
     certificate_number: Text | None = None  # of its own calibration
+    lengths: list[Text] = Field(default_factory=list)  # START - END, names of sockets, or patterns of these
 
 
 class Certificate(Strict):

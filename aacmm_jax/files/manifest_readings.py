@@ -197,7 +197,7 @@ class Readings:
             raise InputError(
                 f'{text.path} has readings in counts; add linear_unit = "counts" and counts_per_mm = [...].'
             )
-        return Angles(**{**stated, "unit": unit})
+        return Angles(**{**stated, "unit": unit}).of_lerobot(angles and angles.written)
 
 
 def directions_of_order(q: Float[np.ndarray, "N n"], least: Float[np.ndarray, " n"]) -> Float[np.ndarray, "N n"]:

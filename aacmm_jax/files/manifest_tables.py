@@ -71,7 +71,7 @@ class Angles(Strict):
     coupled: dict[Annotated[str, Field(pattern="^[1-9][0-9]?$")], Annotated[int, Field(ge=-99, le=99)]] | None = None
 
     calibration: str | None = None  # LeRobot's file of the motors
-    _lerobot: str | None = PrivateAttr(None)
+    _written: "Angles | None" = PrivateAttr(None)
 
     @model_validator(mode="after")
     def _counts(self) -> "Angles":
@@ -93,13 +93,18 @@ class Angles(Strict):
         return self
 
     @property
+    def written(self) -> "Angles | None":
+        """As the manifest has it, with the calibration of LeRobot, where these are the counts that it stands for."""
+        return self._written
+
+    @property
     def lerobot_unit(self) -> str | None:
         """The unit that [angles] stated for LeRobot's numbers, where these are what its counts were made of."""
-        return self._lerobot
+        return None if self._written is None else self._written.unit
 
-    def of_lerobot(self, unit: str) -> "Angles":
-        """The same, as what LeRobot's numbers in this unit became."""
-        self._lerobot = unit
+    def of_lerobot(self, written: "Angles | None") -> "Angles":
+        """The same, as what these became that have a calibration of LeRobot."""
+        self._written = written
         return self
 
     def read_as(self, joints: int) -> tuple[int, ...] | None:

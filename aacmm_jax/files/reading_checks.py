@@ -19,6 +19,7 @@ from .manifest import WrittenRotations, readings_of_manifest
 from .manifest_tables import Angles
 from .reading_sets import pick, tables_of
 
+_DIGITS = 9  # of offsets
 _OTHERS = 2  # conventions that do not fit and are shown
 
 
@@ -54,7 +55,9 @@ def angles_toml(
                 paths = table.get("files", [table.get("file")])
                 file = next(iter(paths.values() if isinstance(paths, dict) else paths))
                 comments.append(f"# In [[{key}]] ({file}), replace the picked columns with:\n# {line}\n")
-    stated = as_read.model_dump(exclude_defaults=True, exclude={"sign", "offset", "columns"})
+    # LeRobot's calibration has a motor for each joint, and its numbers are not rad: elsewhere, what it stands for.
+    written = as_read if exchanged or explanation.angle != 1 else as_read.written or as_read
+    stated = written.model_dump(exclude_defaults=True, exclude={"sign", "offset", "columns"})
     entries: dict[str, Any] = {
         key: [value[i] for i in order] if isinstance(value, list) else value for key, value in stated.items()
     }
@@ -63,12 +66,14 @@ def angles_toml(
         entries.pop("counts_per_turn", None)
     if exchanged or as_read.columns:
         entries["columns"] = reordered(as_read.columns)
-    counts = entries.get("counts_per_turn")
-    size = ANGLE_UNITS[entries["unit"]] if counts is None else 2 * np.pi / np.asarray(counts)
+    counts = as_read.counts_per_turn if explanation.angle == 1 else None
+    size = ANGLE_UNITS[entries["unit"]] if counts is None else 2 * np.pi / np.broadcast_to(counts, joints)[order]
     # With the explanation's sign S and zero Z: S s (c - o) size + Z = S s (c - (o - Z / (S s size))) size.
-    sign, offset = (np.broadcast_to(np.asarray(x, float), joints)[order] for x in (as_read.sign, as_read.offset))
-    sign = sign * explanation.signs
-    offset = np.round(offset - sign * explanation.offsets / size, 9) + 0.0
+    read, sign, offset = (
+        np.broadcast_to(np.asarray(x, float), joints)[order] for x in (as_read.sign, written.sign, written.offset)
+    )
+    sign, offset = sign * explanation.signs, offset - read * explanation.signs * explanation.offsets / size
+    offset = np.round(offset, _DIGITS) + 0.0
     if np.any(sign < 0):
         entries["sign"] = sign.astype(int).tolist()
     if np.any(offset):

@@ -13,6 +13,7 @@ from .tables import View, formatted, listed, plain, warnings_of, written_of
 
 _SINGULAR = 3.0  # mm a rad: 1 mm takes 20 deg of the joints; axes of a wrist are within half a degree of each other
 _LARGE_CHANGE = 5.0  # deg: ten times what link errors of 1 mm and 1 mrad take where no axes align
+_OUTSIDE, _OUTSIDE_SLIDE = 5.0 * DEG, 20.0  # of the range of recorded readings, mm of a prismatic joint
 _MOST_ROWS = 20  # that are printed
 
 
@@ -24,12 +25,13 @@ def correction_summary(
     *,
     unit: str,
     of_readings: bool,
+    recorded: Float[np.ndarray, "M m"] | None = None,
 ) -> dict[str, Any]:
     """Plain values for JSON and display; rows are counted from 1.
 
     ``q``: commanded readings, or those that the search for a pose began with, rad and mm; perhaps with temperatures.
     ``unit``: of readings in the tables. ``of_readings``: whether readings were commanded; of positions with
-    orientations nothing is known of the arm without a correction.
+    orientations nothing is known of the arm without a correction. ``recorded``: the readings of the calibration.
     """
     reached, after = np.asarray(corrected.reached), np.asarray(corrected.q)
     n, kinds = nominal.joints, nominal.geometry.kinds
@@ -61,6 +63,17 @@ def correction_summary(
     if not reached.any():
         return summary
     beside = q[:, n : nominal.beside.own]
+    outside = np.zeros(after.shape) if recorded is None else _outside(nominal, after, recorded[:, :n])
+    far = np.flatnonzero(reached & np.any((outside > 0) & moving, axis=1))
+    if len(far):
+        joint = int(np.argmax(np.where(moving, outside[far] / by_joint(nominal, DEG, 1.0), 0.0).max(axis=0)))
+        amount = outside[far, joint].max() / (1.0 if joint + 1 in nominal.prismatic else DEG)
+        warnings.append(
+            f"In {pluralise(len(far), 'row')} (row {shorten([str(x + 1) for x in far])}) the arm is outside the poses "
+            f"of the calibration (joint {joint + 1} by up to {amount:.0f} "
+            f"{'mm' if joint + 1 in nominal.prismatic else 'deg'}). There the correction is extrapolated, and its "
+            "error may be larger than U. Calibrate with poses in this region, or test the correction there."
+        )
     near = least_motion(nominal, np.hstack([commanded if of_readings else after, beside])) < _SINGULAR
     summary["singular"] = (np.flatnonzero(near & reached) + 1).tolist()
     if summary["singular"]:
@@ -95,6 +108,16 @@ def correction_summary(
             "corrections need large motions. Check these rows before you send an arm to these poses."
         )
     return summary
+
+
+def _outside(arm: Arm, q: Float[np.ndarray, "N n"], recorded: Float[np.ndarray, "M n"]) -> Float[np.ndarray, "N n"]:
+    """How far readings are outside the range of the recorded ones, rad and mm, whole revolutions aside; 0 within it or
+    near it."""
+    low, high = recorded.min(axis=0), recorded.max(axis=0)
+    apart = q - (low + high) / 2
+    apart = np.abs(np.where(by_joint(arm, True, False), apart - 2 * np.pi * np.round(apart / (2 * np.pi)), apart))
+    beyond = apart - (high - low) / 2
+    return np.where(beyond > by_joint(arm, _OUTSIDE, _OUTSIDE_SLIDE), beyond, 0.0)
 
 
 def corrections(summary: dict[str, Any]) -> View:

@@ -239,6 +239,7 @@ DESCRIPTIONS = {
     "Sessions.probe": "Whether the probe was remounted between sessions.",
     "CalibratedItem.model": "The maker's name of the type.",
     "Reference.model": "The maker's name of the type.",
+    "Reference.lengths": "Its lengths in the calibration and the evaluation: `START - END`, the sockets; or a pattern.",
     "Specification.noise": "Noise of the readings and of the seat.",
     "Specification.reference": "The reference length.",
     "ArmFile.noise": "The noise that is usual for this arm.",

@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 from xml.etree import ElementTree
 
+import equinox as eqx
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,7 +13,16 @@ from hypothesis import strategies as st
 
 import aacmm_jax as aj
 from aacmm_jax.calibration.record import Removed
-from aacmm_jax.certificate import dcc_xml, measurement_results, parameter_results, parse_dcc, xml_elements
+from aacmm_jax.certificate import (
+    dcc_xml,
+    document,
+    measurement_results,
+    parameter_results,
+    parse_dcc,
+    printed_certificate,
+    sections,
+    xml_elements,
+)
 from aacmm_jax.diagnostics.findings import findings_of, sentences
 from aacmm_jax.files.administrative_data import (
     AdministrativeData,
@@ -27,6 +37,7 @@ from aacmm_jax.files.administrative_data import (
 )
 from aacmm_jax.kinematics import corrections as kinds
 from aacmm_jax.kinematics.correction_kinds import Loads
+from aacmm_jax.summaries.calibration import calibration_summary
 from tests.certificate import dcc_model
 from tests.certificate.conftest import CREATED, HOSTILE, KINDS
 from tests.refusals import assert_refused
@@ -658,6 +669,80 @@ def test_what_cannot_be_certified_is_refused(record, changes, keywords, parts):
     assert_refused(
         lambda: dcc_xml(record._replace(**changes), AdministrativeData(), **{"created": CREATED} | keywords), *parts
     )
+
+
+def printed(dcc: str, language: str = "en") -> dict[str, sections.Section]:
+    """The parts of the first page, by their titles."""
+    return {section.title: section for section in printed_certificate(dcc, language=language).pages.pages[0]}
+
+
+@pytest.mark.slow
+def test_references_have_the_lengths_that_they_stand_for(record, evaluation):
+    """Of calibration and evaluation, in the DCC and printed; what no reference has remains by itself."""
+    plate, bar = Reference(name="plate", serial_number="7", lengths=["A - B"]), Reference(name="bar", lengths=["D*"])
+    about = AdministrativeData(reference=[plate, bar, Reference(name="sphere")])
+    text = dcc_xml(record, about, created=CREATED, evaluation=evaluation)
+    assert dcc_model.faults(text) == []
+    rows = [(row[0], row[-1].replace("\u00a0", " ")) for row in printed(text)["Traceability"].table]
+    values = [part.recording.capture.lengths for part in (record, evaluation)]
+    a_b, b_c, d_e = (f"{float(length.value):.7g}" for lengths in values for length in lengths)
+    assert rows == [
+        ("plate", f"A - B: {a_b} mm (u = 0.01 mm)"),
+        ("bar", f"D - E: test only: {d_e} mm (u = 0.001 mm)"),
+        ("sphere", "–"),
+        ("Reference lengths", f"B - C: {b_c} mm"),
+    ]
+    assert printed(text)["Traceability"].headings[1:3] == ["Serial number", "Certified values, u (k = 1)"]
+    everything = AdministrativeData(reference=[Reference(name="plate", lengths=["A - B", "B - C"])])
+    assert "Reference lengths" not in contents(
+        dcc_xml(record, everything, created=CREATED), ".//dcc:measuringEquipment"
+    )
+    assert_refused(
+        lambda: dcc_xml(record, about, created=CREATED),
+        *("'bar'", "'D*'", "is not one of the calibration or the evaluation", "A - B, B - C", "--evaluation"),
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("mark", "says", "title", "banner", "german"),
+    [
+        ("good", "Calibrated: U is 0.01 mm.", "", "", ""),
+        ("unsure", "To be used with care: play.", "To be used with care", "", "Nur mit Vorbehalt"),
+        ("bad", "Not usable: bent.", "Not usable", "Not usable: the arm must not be used", "Nicht verwendbar"),
+    ],
+)
+def test_a_calibration_to_be_used_with_care_says_so(record, monkeypatch, mark, says, title, banner, german):
+    monkeypatch.setattr(document, "calibration_summary", lambda _: {"verdict": {"mark": mark, "says": says}})
+    text = dcc_xml(record, AdministrativeData(), created=CREATED)
+    assert dcc_model.faults(text) == []
+    stated = contents(text, ".//dcc:statement")
+    pages, paragraphs = printed_certificate(text).pages, printed(text)["Measurement uncertainty"].paragraphs
+    assert ([title, says] == stated[(i := stated.index(title)) : i + 2]) if title else says not in stated
+    assert paragraphs[1:] == ([says] if title else [])
+    assert pages.banner.startswith(banner)
+    assert bool(pages.banner) == bool(banner)
+    translated = printed(text, "de")["Messunsicherheit"].paragraphs[1:]
+    assert [words.startswith(german) for words in translated] == ([True] if title else [])
+
+
+@pytest.mark.slow
+def test_the_verdict_is_that_of_the_calibration(record, monkeypatch):
+    """As the terminal says it: residuals larger than those of an arm."""
+    observed = eqx.tree_at(lambda metrics: metrics.rms_after, record.observed, record.observed.rms_after * 300)
+    coarse = record._replace(observed=observed)
+    verdict = calibration_summary(coarse)["verdict"]
+    assert verdict["mark"] in ("unsure", "bad")
+    assert verdict["says"] in contents(dcc_xml(coarse, AdministrativeData(), created=CREATED), ".//dcc:statement")
+
+
+@pytest.mark.slow
+def test_the_uncertainty_says_whether_it_includes_errors_beyond_the_model(record):
+    """Where residuals show shared errors, the covariance contains them."""
+    assert record.shared is not None
+    for shared, included in ((record.shared, "included as far as the residuals show them"), (None, "not included")):
+        says = measurement_results.uncertainty_statement(record._replace(shared=shared))
+        assert says.endswith(f"Errors that the Denavit-Hartenberg model does not describe are {included}.")
 
 
 @pytest.mark.slow

@@ -212,6 +212,21 @@ def test_rows_at_a_singular_wrist_are_named():
     assert summary["warnings"][0].startswith("In 1 row (row 2) the nominal arm is at a singularity")
 
 
+def test_rows_outside_the_recorded_poses_are_named():
+    """Beyond 5 deg of their range, whole revolutions aside; what is not reached is named already."""
+    nominal = aj.load_arm("ur10e")
+    recorded = np.array([[0.2, -1.6, 1.0, 0.2, 0.7, -0.3], [0.4, -0.6, 1.4, 0.6, 1.3, 0.3]])
+    q = np.tile(recorded.mean(axis=0), (4, 1))
+    q[1, 2] += 0.2 + 20 * DEG
+    q[2, 2] += 0.2 + 4 * DEG
+    q[3, 0] -= 2 * np.pi
+    found = corrected_readings(nominal, nominal.replace(d_6=nominal.d[5] + 0.01), q)
+    about = {"unit": "rad", "of_readings": True}
+    (said,) = correction_summary(nominal, nominal, q, found, recorded=recorded, **about)["warnings"]
+    assert said.startswith("In 1 row (row 2) the arm is outside the poses of the calibration (joint 3 by up to 20 deg)")
+    assert correction_summary(nominal, nominal, q, found, recorded=q, **about)["warnings"] == []
+
+
 def test_poses_of_a_urdf_are_in_its_base_link():
     specification = aj.files.load_specification(URDF, base="shoulder", tip="tool0")
     base = aj.files.urdf_chain(specification.urdf).base

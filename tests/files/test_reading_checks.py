@@ -1,6 +1,7 @@
 """Checks of readings: commanded and measured readings in one table, found by their names and compared by calibrating
 from both; and what a check prints for a manifest, which makes its readings those of the arm."""
 
+import json
 import math
 import re
 import shutil
@@ -141,6 +142,9 @@ COUNTS = 4096 / (2 * math.pi)
         (NAMES.format(unit=" [rad]"), 1.0, "", ""),
         (NAMES.format(unit=""), 180 / math.pi, 'unit = "deg"', ""),
         (NAMES.format(unit=""), COUNTS, 'unit = "counts"\ncounts_per_turn = 4096', ""),
+        (NAMES.format(unit=""), 180 / math.pi * 4096 / 4095, 'unit = "deg"\ncalibration = "motors.json"', ""),
+        (NAMES.format(unit=""), COUNTS, 'unit = "counts"\ncalibration = "motors.json"\noffset = -5', ""),
+        (NAMES.format(unit=""), 100 / math.pi, 'unit = "percent"\ncalibration = "motors.json"', ""),
         (NAMES.format(unit=""), 180 / math.pi, 'unit = "rad"', 'units = { q = "deg" }'),
         (
             NAMES.format(unit=" [deg]"),
@@ -155,6 +159,8 @@ COUNTS = 4096 / (2 * math.pi)
 @pytest.mark.parametrize("order", [PLAIN, ORDER])
 def test_the_table_pasted_into_the_manifest(tmp_path, header, size, angles, socket, order):
     np.savetxt(tmp_path / "a.csv", recorded(order, ZEROS) * size, delimiter=",", header=header, comments="")
+    motor = {"drive_mode": 0, "homing_offset": 0, "range_min": -2043, "range_max": 2053}
+    (tmp_path / "motors.json").write_text(json.dumps({f"J{i}": {"id": i, **motor} for i in range(1, 7)}))
     manifest = tmp_path / "m.toml"
 
     def write(table, line):
@@ -169,6 +175,7 @@ def test_the_table_pasted_into_the_manifest(tmp_path, header, size, angles, sock
     )
     line = printed.split("\n# columns")[1].strip() if "\n# columns" in printed else socket.removeprefix("columns")
     line = f"columns {line}" if "columns" in socket else socket
+    assert ("calibration" in printed) == ("calibration" in angles and order == PLAIN)
     np.testing.assert_allclose(write(printed, line), Q, atol=1e-8)
 
 

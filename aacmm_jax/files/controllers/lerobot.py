@@ -82,7 +82,7 @@ def angles_by_motors(angles: Angles, file: InputFile, joints: int) -> Angles:
         offsets = [offset + middle for offset, middle in zip(offsets, middles, strict=False)]
     stated = angles.model_dump(exclude_unset=True, exclude={"calibration"})
     converted = {**stated, "unit": "counts", "counts_per_turn": counts, "sign": signs, "offset": offsets}
-    return Angles(**converted).of_lerobot(angles.unit)
+    return Angles(**converted).of_lerobot(angles)
 
 
 def lerobot_calibration(
