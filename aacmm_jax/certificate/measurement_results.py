@@ -52,6 +52,8 @@ _HELD_OUT = {
     "largest_mm": "largest distance",
     "rms_predicted_mm": "RMS distance, predicted",
 }
+# Lengths that no reference stands for, of the calibration and of the test, and how names of the latter begin.
+LENGTHS_OF_NONE, OF_TEST = ("Reference lengths", "Lengths of the test"), "Test "
 _MEASURED = {
     "mm": "standard uncertainty of a measured coordinate or distance",
     "rad": "standard uncertainty of a measured angle or orientation about each axis",
@@ -174,10 +176,11 @@ def _equipment(
             artefact.append(_quantities(lengths, names))
             assigned.update(names)
         yield artefact
-    fitted = itertools.islice(lengths, len(record.recording.capture.lengths))
-    if others := [name for name in fitted if name not in assigned]:
-        unknown = "" if references else f"Artefact: {NOT_STATED}"
-        yield named("measuringEquipment", "Reference lengths", _quantities(lengths, others), says=unknown)
+    unknown = "" if references else f"Artefact: {NOT_STATED}"
+    for of_test, name in enumerate(LENGTHS_OF_NONE):
+        others = [key for key in lengths if key not in assigned and key.startswith(OF_TEST) == of_test]
+        if others:
+            yield named("measuringEquipment", name, _quantities(lengths, others), says=unknown)
     # Observations with the same certified values are of one artefact in several placements, which is named once.
     equipment: dict[tuple, tuple[list[str], str, list[Quantity]]] = {}
     for part in residuals:
@@ -213,7 +216,7 @@ def _certified_lengths(record: CalibrationRecord, evaluation: EvaluationRecord |
     lengths: list[tuple[str, Sequence[ReferenceLength]]] = [("", record.recording.capture.lengths)]
     if evaluation is not None:
         tested = evaluation.recording.capture.lengths
-        lengths.append(("Test ", [tested[i] for i in evaluation.held_out_lengths()]))
+        lengths.append((OF_TEST, [tested[i] for i in evaluation.held_out_lengths()]))
     return {f"{of}{_length_name(i, x)}": x for of, rows in lengths for i, x in enumerate(rows, start=1)}
 
 

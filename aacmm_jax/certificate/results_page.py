@@ -56,7 +56,7 @@ def results_page(results: dict[str, Element], statements: dict, words: Language)
         rule = content(stated, "dcc:declaration")
         facts = [
             (words("specification"), stated.findtext("dcc:norm", "", PREFIXES)),
-            (words("verdict"), words(stated.findtext("dcc:conformity", "", PREFIXES))),
+            (words("verdict"), _verdict(stated, tests[0].values(), before, words)),
         ]
     for key, text in RULES.items():
         rule = rule.replace(text, words(key))
@@ -64,6 +64,15 @@ def results_page(results: dict[str, Element], statements: dict, words: Language)
         facts[1:1] = [(words("decision_rule"), rule), (words("limits"), _limits(tests[1].values(), words))]
     yield Section(words("conformity"), facts, [] if facts else [words("no_conformity_sentence")])
     yield from _findings(statements, words)
+
+
+def _verdict(stated: Element, earlier: Iterable[Element], before: str, words: Language) -> str:
+    """The verdict, that it is of the calibrated parameters, and whether the arm fails with those before."""
+    verdict = words("verdict_sentence", verdict=words(stated.findtext("dcc:conformity", "", PREFIXES)))
+    metrics = (part for test in earlier for part in named_in(test, "dcc:data/dcc:list").items())
+    fails = [symbol for symbol, metric in metrics
+             if any(_limit(x)[1] == "fail" for x in metric.iterfind("dcc:quantity", PREFIXES))]  # fmt: skip
+    return "; ".join([verdict, *([words(f"fails_{before}_sentence", metrics=", ".join(fails))] if fails else [])])
 
 
 def _limits(tests: Iterable[Element], words: Language) -> str:

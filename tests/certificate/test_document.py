@@ -297,6 +297,40 @@ def test_a_conformity_rests_on_results(record, full, evaluation):
     assert_refused(certificate(other, "pass"), "another calibration")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("before", "limit", "english", "german"),
+    [
+        ("nominal", 0.5, "; with the nominal parameters, the arm fails (Deltam)", "; mit den Nennparametern hält"),
+        ("as_found", 0.5, "; with the parameters as found, the arm fails (Deltam)", "; mit den Parametern bei Eingang"),
+        ("nominal", 50.0, "", ""),
+    ],
+)
+def test_conformity_is_of_the_calibrated_parameters(record, full, evaluation, before, limit, english, german):
+    """And where the arm fails with those before, this is stated as well."""
+    as_found = record.recording.nominal if before == "as_found" else None
+    record, evaluation = (x._replace(recording=x.recording._replace(as_found=as_found)) for x in (record, evaluation))
+    evaluation = evaluation._replace(limits={"Deltam": aj.acceptance.Limit(limit)})
+    worst = {stage: tests[0].metrics[0].value for stage, tests in evaluation.acceptance().items()}
+    assert (worst[before] > limit) == bool(english)
+    assert worst["calibrated"] < 0.1
+    stated = Conformity(verdict="pass", specification="S")
+    dcc = dcc_xml(record, full.model_copy(update={"conformity": stated}), created=CREATED, evaluation=evaluation)
+    assert dcc_model.faults(dcc) == []
+    (says,) = [x for x in contents(dcc, "*/dcc:statements") if x.startswith("The statement of conformity holds")]
+    assert says.endswith(english[2:].replace("with", "With") + ".") if english else says.endswith("parameters.")
+    for language, begins, fails in (("en", "conforms, with the c", english), ("de", "konform, mit den k", german)):
+        (text,) = [
+            value
+            for section in printed_certificate(dcc, language=language).pages.pages[1]
+            for key, value in section.facts
+            if key in ("Statement of conformity", "Konformitätsaussage")
+        ]
+        assert text.startswith(begins)
+        assert fails in text
+        assert (";" in text) == bool(fails)
+
+
 @pytest.mark.parametrize(
     ("stated", "used", "printed"),
     [
@@ -678,20 +712,31 @@ def printed(dcc: str, language: str = "en") -> dict[str, sections.Section]:
 
 @pytest.mark.slow
 def test_references_have_the_lengths_that_they_stand_for(record, evaluation):
-    """Of calibration and evaluation, in the DCC and printed; what no reference has remains by itself."""
+    """Of calibration and evaluation, in the DCC and printed, those of the test apart; what no reference has remains by
+    itself."""
     plate, bar = Reference(name="plate", serial_number="7", lengths=["A - B"]), Reference(name="bar", lengths=["D*"])
     about = AdministrativeData(reference=[plate, bar, Reference(name="sphere")])
     text = dcc_xml(record, about, created=CREATED, evaluation=evaluation)
     assert dcc_model.faults(text) == []
-    rows = [(row[0], row[-1].replace("\u00a0", " ")) for row in printed(text)["Traceability"].table]
+    rows, of_test = (
+        [(row[0], row[-1].replace("\u00a0", " ")) for row in printed(text)[title].table]
+        for title in ("Traceability", "Used for the test only")
+    )
     values = [part.recording.capture.lengths for part in (record, evaluation)]
     a_b, b_c, d_e = (f"{float(length.value):.7g}" for lengths in values for length in lengths)
     assert rows == [
         ("plate", f"A - B: {a_b} mm (u = 0.01 mm)"),
-        ("bar", f"D - E: test only: {d_e} mm (u = 0.001 mm)"),
         ("sphere", "–"),
         ("Reference lengths", f"B - C: {b_c} mm"),
     ]
+    assert of_test == [("bar", f"D - E: {d_e} mm (u = 0.001 mm)")]
+    both = AdministrativeData(reference=[Reference(name="plate", lengths=["A - B", "D - E"])])
+    text_of_both = dcc_xml(record, both, created=CREATED, evaluation=evaluation)
+    assert "test only: " in printed(text_of_both)["Traceability"].table[0][-1]
+    assert "Used for the test only" not in printed(text_of_both)
+    none = AdministrativeData(reference=[Reference(name="bar")])
+    (row,) = printed(dcc_xml(record, none, created=CREATED, evaluation=evaluation))["Used for the test only"].table
+    assert [x.replace("\u00a0", " ") for x in row] == ["Lengths of the test", f"D - E: {d_e} mm (u = 0.001 mm)"]
     assert printed(text)["Traceability"].headings[1:3] == ["Serial number", "Certified values, u (k = 1)"]
     everything = AdministrativeData(reference=[Reference(name="plate", lengths=["A - B", "B - C"])])
     assert "Reference lengths" not in contents(
