@@ -10,6 +10,7 @@ from ..acceptance.record import EvaluationRecord, same_arm
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
 from ..calibration.record import REPEATABILITY, CalibrationRecord
 from ..core.errors import InputError
+from ..data.capture import names_in
 from ..diagnostics.contradictions import LEFT_OUT
 from ..diagnostics.findings import findings_of
 from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity
@@ -18,7 +19,17 @@ from ..summaries.observations import scale_sources
 from ..uncertainty.coverage import COVERAGE_FACTOR
 from . import xml_elements as xml
 from .measurement_results import results_of, uncertainty_statement
-from .xml_elements import MILLIMETRE, element, english, equipment_quantity, named, optional, real, text
+from .xml_elements import (
+    LEFT_OUT_NAMES,
+    MILLIMETRE,
+    element,
+    english,
+    equipment_quantity,
+    named,
+    optional,
+    real,
+    text,
+)
 
 VERSION = "3.3.0"
 Tests = Mapping[str, Sequence[AcceptanceTest]]  # acceptance tests by the parameters: nominal, as_found, calibrated
@@ -218,8 +229,10 @@ def _statements(
         yield _statement("Monte Carlo", record.sampled_says, norm="JCGM 101:2008")
     for finding in findings_of(record):
         if finding.code == LEFT_OUT:
-            members = f"Sockets and observations left out: {', '.join(finding.concerns)}."
-            yield _statement("Data left out", f"{finding.sentence} {members}")
+            # Of poses, what was probably done wrong concerns sockets that are not left out.
+            kept = names_in(record.recording.capture)
+            names = ", ".join(name for name in finding.concerns if name not in kept)
+            yield _statement("Data left out", f"{finding.sentence}{LEFT_OUT_NAMES}{names}.")
         else:
             yield _statement("Warning", finding.sentence)
     if sources:
@@ -261,7 +274,7 @@ def _acceptance_results(record: EvaluationRecord, by_stage: Tests) -> Iterator[E
             "The uncertainty includes only the contributions of the tester (ISO 14253-5), combined as independent "
             "contributions."
         )
-        data = element("data", english("text", _influences(record)))
+        data = element("data", english("text", _influences(record)), _stated_u(record))
         condition = named("influenceCondition", "Uncertainty of the test", xml.adjustment_status(stage), data)
         editions = dict.fromkeys(test.called for test in tests)
         evaluation = "Evaluation of the uncertainty of the tests"
@@ -283,16 +296,21 @@ def _acceptance_results(record: EvaluationRecord, by_stage: Tests) -> Iterator[E
 
 def _influences(record: EvaluationRecord) -> str:
     given = record.influences
-    parts = [f"Standard uncertainty of seat and fixture: {1000 * record.u_test:.3g} um"]
-    if given.u_relative:
-        parts.append(f"in proportion to the length: {given.u_relative:.3g}")
+    parts = []
     for name, body in (("artefact", given.artefact), ("arm", given.arm)):
         if body is not None:
             parts.append(
-                f"the {name} expands by {body.coefficient:.4g} / K (u = {body.u_coefficient:.2g} / K), at "
-                f"{body.temperature:g} C (u = {body.u_temperature:g} C); lengths are corrected for this expansion"
+                f"The {name} expands by {body.coefficient:.4g} / K (u = {body.u_coefficient:.2g} / K), at "
+                f"{body.temperature:g} C (u = {body.u_temperature:g} C); lengths are corrected for this expansion."
             )
-    return "; ".join(parts) + ". The arm's own scatter is not included, because it is what is tested."
+    return " ".join([*parts, "The arm's own scatter is not included, because it is what is tested."])
+
+
+def _stated_u(record: EvaluationRecord) -> Iterator[Element]:
+    """Standard uncertainties of the test besides those of its artefacts."""
+    yield named("quantity", "Standard uncertainty of seat and fixture", real(record.u_test, MILLIMETRE))
+    if record.influences.u_relative:
+        yield named("quantity", "Standard uncertainty per length", real(record.influences.u_relative, xml.ONE))
 
 
 def _test(test: AcceptanceTest, judged: bool) -> Element:

@@ -38,6 +38,7 @@ from aacmm_jax.files.administrative_data import (
 from aacmm_jax.kinematics import corrections as kinds
 from aacmm_jax.kinematics.correction_kinds import Loads
 from aacmm_jax.summaries.calibration import calibration_summary
+from aacmm_jax.summaries.evaluation import evaluation_summary
 from tests.certificate import dcc_model
 from tests.certificate.conftest import CREATED, HOSTILE, KINDS
 from tests.refusals import assert_refused
@@ -437,6 +438,21 @@ def test_held_out_poses_have_their_errors(record):
 
 
 @pytest.mark.slow
+def test_held_out_poses_of_an_evaluation_are_those_that_it_shows(evaluation, certificates):
+    held_out = evaluation_summary(evaluation)["held_out"]
+    poses, by_arm = held_out["predicted"]["poses"], held_out["calibrated"]
+    shown = {
+        "poses": poses["poses"],
+        "RMS distance": poses["rms_mm"],
+        "largest distance from the mean position": by_arm["distance_largest_mm"],
+        "RMS distance, predicted": poses["rms_predicted_mm"],
+    }
+    values = parse_dcc(certificates["all stated"])
+    stated = {key[2]: value.value for key, value in values.items() if key[1] == "Held-out poses"}
+    assert stated == pytest.approx(shown, abs=5.1e-7)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [5e-324, -0.0, 1e-5, 0.1, 1 / 3, -123456789.125, 1e99])
 def test_any_number_reads_back(record, value):
     text = dcc_xml(record, AdministrativeData(), created=CREATED)
@@ -553,7 +569,7 @@ def test_what_is_stated_is_in_the_certificate(certificates, full):
     assert "first line\nsecond line" in contents(text, "*/dcc:statements")
     assert "a.h5, <b>.toml" in contents(text, "*/dcc:statements")
     equipment = "*/dcc:measurementResult[1]/dcc:measuringEquipments/dcc:measuringEquipment"
-    assert contents(text, f"{equipment}/dcc:name") == ["ball bar", "Reference lengths"]
+    assert contents(text, f"{equipment}/dcc:name") == ["ball bar", "Reference lengths", "Lengths of the test"]
     assert parse_dcc(text)["Calibrated parameters", "Scale", "k"].expanded
     temperature = root.find(f"*/{DCC}measurementResult/{DCC}influenceConditions//{SI}real")
     assert temperature is not None
@@ -594,8 +610,18 @@ def test_what_was_left_out_is_stated(record):
     assert said.startswith(
         "Left out: station T2, which contradicts the other data (F = 45.6 with 6 and 60 degrees of freedom"
     )
-    assert said.endswith("Sockets and observations left out: T2/day, T2/night.")
+    assert said.endswith("Sockets, observations or poses left out: T2/day, T2/night.")
     assert sum("they contradict the rest: station T2;" in one for one in contents(text, ".//dcc:usedMethods")) == 2
+    # What was done wrong with poses concerns sockets that remain.
+    poses = removed._replace(
+        kind="poses", group="A pose 1, A pose 7 (in B)", members=("A", "B", "A pose 1", "A pose 7")
+    )
+    text = dcc_xml(record._replace(removed=(poses, removed)), AdministrativeData(), created=CREATED)
+    assert any(one.endswith(" left out: A pose 1, A pose 7.") for one in contents(text, "*/dcc:statements"))
+    notes = printed_certificate(text, language="de").pages.pages[1][-1].notes
+    assert notes[0].startswith("Nicht verwendet, weil sie den übrigen Daten widersprechen: ")
+    assert {*notes[0].partition(": ")[2].partition(". ")[0].split(", ", 2)[:1]} <= {"A (Stellungen 1", "T2/day"}
+    assert all(says in notes[0] for says in ("A (Stellungen 1, 7)", "T2/day, T2/night"))
     hostile = record._replace(removed=(removed._replace(members=("A\x1b",)),))
     assert_refused(lambda: dcc_xml(hostile, AdministrativeData(), created=CREATED), r"A\x1b", "U+001B")
 
