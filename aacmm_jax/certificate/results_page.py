@@ -49,6 +49,7 @@ def results_page(results: dict[str, Element], statements: dict, words: Language)
     called = dict.fromkeys(name.partition(": ")[0] for name in tests[1])
     for standard in called:
         yield _tests(standard, tests[0], tests[1], before, u_test, words)
+        u_test = ""  # said once
     norms = {
         norm.text: None for test in tests[1].values() for norm in test.iterfind(".//dcc:metaData/dcc:norm", PREFIXES)
     }
@@ -266,7 +267,8 @@ def _tests(
             ]
             says = words("metric_" + re.split("[.:]", symbol)[0])
             rows.append([symbol, says, *numbers, words(verdict) if verdict else "–"])
-    sentences = [words("tests_sentence", factor=words.number(next(iter(factors), "2")), u=u_test)]
+    factor = words.number(next(iter(factors), "2"))
+    sentences = [words("tests_sentence", factor=factor, u=u_test)] if u_test else []
     if incomplete:
         lacking = words.translated(" ".join(missing))
         sentences.append(words("incomplete_sentence", standard=edition))

@@ -135,7 +135,7 @@ def test_what_a_laboratory_states_is_printed(certificates):
     assert {"b", "script"}.isdisjoint(Texts(page).tags)
     assert "Konformitätsaussage" in texts
     assert "unentschieden (innerhalb der Grenze), mit den kalibrierten Parametern" in "; ".join(texts)
-    assert any("mit u = 0,001\u00a0mm, 1e-06\u00a0L für Aufnahme und Halterung" in text for text in texts)
+    assert any("mit u = 0,001\u00a0mm,\u00a01e−06\u00a0L für Aufnahme und Halterung" in text for text in texts)
     assert any(text.endswith("Gefordert sind 30 verschiedene Orte (vorhanden: 1).") for text in texts)
 
 

@@ -65,15 +65,19 @@ class Language(NamedTuple):
 
     def translated(self, sentences: str) -> str:
         """Sentences on what a procedure lacks; "" where this language does not have one of them."""
+        if self.code == "en":
+            return sentences
         translated, end = [], 0
-        while self.code != "en" and end < len(sentences):
-            found = next(((x, text) for says, text in self.missing if (x := says.match(sentences, end))), None)
-            if found is None:
+        while end < len(sentences):
+            matches = [(match, text) for pattern, text in self.missing if (match := pattern.match(sentences, end))]
+            if not matches:
                 return ""
-            numbers = {name.removeprefix("n"): value for name, value in found[0].groupdict().items()}
-            translated.append(_NAMED.sub(lambda x, numbers=numbers: self.number(numbers[x[1]]), found[1]))
-            end = found[0].end()
-        return " ".join(translated).replace(" %", "\u00a0%") or sentences
+            # Texts in braces may reach over several sentences: the shortest match is one.
+            match, text = min(matches, key=lambda found: found[0].end())
+            numbers = {name[1:]: self.number(value) for name, value in match.groupdict().items()}
+            translated.append(_NAMED.sub(lambda name, numbers=numbers: numbers[name[1]], text))
+            end = match.end()
+        return " ".join(translated).replace(" %", "\u00a0%")
 
     def stated(self, text: str) -> str:
         """A text, or that it is not stated, in this language."""
