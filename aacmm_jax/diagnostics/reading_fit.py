@@ -135,7 +135,7 @@ class ReadingFit:
         mount take up; none that are still needed; and the residual."""
         zeros, rms = self.with_free_zeros(hypothesis)
         zeros[[0, -1]] = 0
-        offsets = tuple(map(_rounded, hypothesis.offsets + zeros))
+        offsets = tuple(map(_rounded, (np.array(hypothesis.offsets) + zeros).tolist()))
         return hypothesis._replace(offsets=offsets), 0 * zeros, rms
 
     def with_tip_found(self, explanation: Explanation) -> float:
