@@ -152,7 +152,7 @@ def checked_fit(fit: ReadingFit, likely: Sequence[Hypothesis] = ()) -> ReadingCh
     """The hypotheses that the search finds, and others that are likely, refitted and compared."""
     arm, evidence, n = fit.arm, fit.evidence, fit.arm.joints
     given = fit.explanation(Hypothesis(tuple(range(n)), (1,) * n, (0.0,) * n))
-    candidates, tried = [([hypothesis], *fit.with_free_zeros(hypothesis)) for hypothesis in likely], 0
+    candidates, tried = [([fitted], zeros, rms) for fitted, zeros, rms in map(fit.with_fitted_zeros, likely)], 0
     for angle, length in possible_units(fit):
         rms, hypotheses, count = search(arm, evidence.scaled(angle, length).thinned(), fit.lever)
         tried += count

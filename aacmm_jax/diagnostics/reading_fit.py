@@ -128,9 +128,15 @@ class ReadingFit:
             if changed.rms_fitted <= _NEARLY * rms + _EXACT * self.size or not waiting:
                 return changed
             joint = waiting.pop(0)
-            offset = math.remainder(offsets[joint] + zeros[joint], 2 * math.pi)
-            quarter = round(offset / (math.pi / 2)) * (math.pi / 2)
-            offsets[joint] = quarter if abs(offset - quarter) < _ZERO else offset
+            offsets[joint] = _rounded(offsets[joint] + zeros[joint])
+
+    def with_fitted_zeros(self, hypothesis: Hypothesis) -> tuple[Hypothesis, Float[np.ndarray, " n"], float]:
+        """The hypothesis with the zeros that fit best, but for those of the first and the last joint, which base and
+        mount take up; none that are still needed; and the residual."""
+        zeros, rms = self.with_free_zeros(hypothesis)
+        zeros[[0, -1]] = 0
+        offsets = tuple(map(_rounded, (np.array(hypothesis.offsets) + zeros).tolist()))
+        return hypothesis._replace(offsets=offsets), 0 * zeros, rms
 
     def with_tip_found(self, explanation: Explanation) -> float:
         """The residual of the nominal arm with the tip where it fits best in the last frame, mm."""
@@ -196,6 +202,13 @@ class ReadingFit:
         by_angles = np.moveaxis(np.asarray(rotation_columns(forward, self._indices)), -1, 0).swapaxes(1, 2)
         rows = self.lever * by_angles.reshape(turned.size, -1)
         return np.concatenate([residual, self.lever * turned]), np.concatenate([flat, rows])
+
+
+def _rounded(offset: float) -> float:
+    """The zero, or the quarter of a revolution near which it is."""
+    offset = math.remainder(float(offset), 2 * math.pi)
+    quarter = round(offset / (math.pi / 2)) * (math.pi / 2)
+    return quarter if abs(offset - quarter) < _ZERO else offset
 
 
 def _means(values: Float[np.ndarray, "m ..."], owner: np.ndarray) -> Float[np.ndarray, "m ..."]:

@@ -58,9 +58,8 @@ def test_too_many_joints_are_left_to_the_search_of_orders(monkeypatch):
 @pytest.mark.slow
 def test_readings_of_lerobot_whose_zeros_and_first_sign_are_not_the_model_s(tmp_path):
     pytest.importorskip("cv2")
-    (tmp_path / "webcam").symlink_to(EXAMPLES / "webcam", target_is_directory=True)
     path = tmp_path / "arm.toml"
-    path.write_text(MANIFEST.format(folder="webcam"))
+    path.write_text(MANIFEST.format(folder=(EXAMPLES / "webcam").as_posix()))  # elsewhere: images have whole paths
     recording = aj.files.read_manifest(path)
     check = check_capture(recording.nominal.arm, recording.capture)
     assert (check.explained, check.best.signs, check.others) == (True, (-1, 1, 1, 1, 1), ())
