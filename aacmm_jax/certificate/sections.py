@@ -62,7 +62,8 @@ def shortened(text: str) -> str:
     """A number as the DCC has it, but of those that were given to 17 digits at most 7, and none below 1e-9."""
     if len(text.partition(".")[2]) <= 8 and "e" not in text.lower():
         return text
-    return f"{float(text):.7g}" if abs(float(text)) >= _LEAST else "0.0"
+    short = f"{float(text):.7g}" if abs(float(text)) >= _LEAST else "0.0"
+    return short if {*".e"} & {*short} else f"{short}.0"
 
 
 def expanded_of(quantity: Element) -> tuple[str, str]:

@@ -79,7 +79,7 @@ class AbstractCorrection(abc.ABC):
     model: ClassVar[str]  # its name in ``--model dh,harmonics=1``: lowercase letters
     words: ClassVar[tuple[str, ...]]  # with which the names of its coefficients begin: lowercase letters
     description: ClassVar[str]  # what its coefficients are, in the plural: "errors of gear ratios"
-    unit: ClassVar[str]  # of a revolute joint's coefficient, of 1, rad, mm, m, K and kN; of others mm instead of rad
+    unit: ClassVar[str]  # of a coefficient: 1, rad (for a prismatic joint read as mm), mm, m, K and kN, as in 1/rad
     unit_alone: ClassVar[str] = ""  # where it differs: of a coefficient whose name has no number
     usual_size: ClassVar[float]  # about how large coefficients usually are, in this unit: expected by the default prior
     usual_of_slide: ClassVar[float | None] = None  # the same where a joint is prismatic, mm; None: as of others
@@ -87,11 +87,11 @@ class AbstractCorrection(abc.ABC):
     of_arm: ClassVar[bool] = False  # whether it scales all lengths of the arm: its terms are of joint 0
     of_own_reading: ClassVar[bool] = False  # whether each function is of its joint's reading alone, and can be drawn
     of_other_reading: ClassVar[bool] = False  # whether each function is the reading of the joint that `Term.number` is
-    column: ClassVar[str] = ""  # which of `beside.COLUMNS` its functions read, where it was recorded
+    column: ClassVar[str] = ""  # recorded column that its functions read: torques, directions, load or thermometer
     of_masses: ClassVar[bool] = False  # whether functions without a number need the masses of the links
-    has_options: ClassVar[bool] = False  # whether a model may say more of it, as harmonics=1-3 does
+    has_options: ClassVar[bool] = False  # whether a model may state an option after =, as in ``harmonics=1-3``
     sought: ClassVar[tuple[Sought, ...]] = ()  # what residuals of a calibration without it are searched for
-    shared: ClassVar[str | None] = None  # option of the model whose functions poses may share errors by; None: none
+    shared: ClassVar[str | None] = None  # option of the functions that shared errors of poses may follow; None: none
 
     def terms(self, joints: int, option: str, loads: Loads | None) -> tuple["Term", ...]:
         """The terms of a model for an arm of so many joints; the option of ``harmonics=2`` is "2", by default empty."""
@@ -110,7 +110,7 @@ class AbstractCorrection(abc.ABC):
         return {self.model: self.usual_size}
 
     def column_of(self, term: "Term") -> str:
-        """Which of `beside.COLUMNS` the function of a term reads; empty for none."""
+        """The recorded column that the function of a term reads, as in `column`; empty for none."""
         return self.column
 
     @abc.abstractmethod

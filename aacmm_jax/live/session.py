@@ -193,7 +193,8 @@ class Session:
             poses = fitting(self._poses_seen, self._stop)
             true = next((arm for device in self._devices if (arm := device.truth()) is not None), None)
             read_as = next((device.read_as for device in self._devices if device.joints), None)
-            paths, says = written(self.setup, poses, self.path, calibrate, true, read_as)
+            sources = tuple(source for device in self._devices for source in device.sources)
+            paths, says = written(self.setup, poses, self.path, calibrate, true, read_as, sources)
         finally:
             with self._lock:
                 self._busy = None

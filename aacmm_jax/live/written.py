@@ -35,10 +35,11 @@ def written(
     calibrate: bool,
     true: Arm | None = None,
     read_as: tuple[int, ...] | None = None,
+    sources: tuple[str, ...] = (),
 ) -> tuple[list[str], list[str]]:
     """Write a capture, and if asked for its calibration and report beside it; the names of the files, and what the
-    calibration says: its verdict, and its warnings. ``true``: the arm of a simulation; ``read_as``: that of
-    `Recording`."""
+    calibration says: its verdict, and its warnings. ``true``: the arm of a simulation; ``read_as`` and
+    ``sources``: those of `Recording`."""
     from ..calibration.record import uncertainty_of
     from ..files.calibrations import save_calibration
     from ..pipeline.capture_calibration import calibrate_capture
@@ -49,7 +50,8 @@ def written(
     capture, _ = capture_of(setup, poses)
     simulated = None if true is None else setup.specification._replace(arm=true)
     day = time.strftime("%Y-%m-%d")
-    recording = Recording(capture, setup.specification, simulated, usual=setup.noise, measured=day, read_as=read_as)
+    told = {"usual": setup.noise, "measured": day, "read_as": read_as, "sources": sources}
+    recording = Recording(capture, setup.specification, simulated, **told)
     save_capture(path, recording)
     if not calibrate:
         return [str(path)], []

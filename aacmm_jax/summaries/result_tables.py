@@ -249,6 +249,7 @@ def held_out_tables(summary: Row) -> list[Table]:
     uses = [{"": name.replace("_", "-")} | summary[name] for name in ("held_out", "used")]
     rows, columns = summary["observations"], {
         "poses": "poses",
+        **({"RMS nominal": "rms_nominal_mm"} if uses[0]["rms_nominal_mm"] is not None else {}),
         "RMS": "rms_mm",
         "mean": "mean_mm",
         "largest": "largest_mm",

@@ -175,6 +175,20 @@ def test_a_certified_value_is_rounded_to_two_digits_of_its_u(value, u, printed):
     assert sections.with_u(quantity, languages.language_of("en")) == printed.replace(" ", "\u00a0")
 
 
+@pytest.mark.parametrize(
+    ("text", "printed"),
+    [
+        ("40.000000000000007", "40.0"),
+        ("1.5707963267948966", "1.570796"),
+        ("-6e-17", "0.0"),
+        ("2e+20", "2e+20"),
+        ("40.5", "40.5"),
+    ],
+)
+def test_numbers_of_17_digits_are_printed_shorter(text, printed):
+    assert sections.shortened(text) == printed
+
+
 def test_one_is_singular():
     german = languages.language_of("de")
     several = [german.counted("other observations", number) for number in ("1", "2")]

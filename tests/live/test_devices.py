@@ -1,6 +1,7 @@
 """Devices that are no lines: a bus of servos, a camera, and the simulated arm, whose truth is known."""
 
 import contextlib
+import json
 import os
 import threading
 import time
@@ -158,6 +159,25 @@ def test_servos_on_a_bus_are_read_and_bad_answers_counted(tmp_path):
     os.close(bus.master)
     assert samples_of(device, 1, 0.5) == []
     assert "trying again" in device.message
+    device.close()
+
+
+@pytest.mark.parametrize("unit", ["counts", "deg"])
+def test_zeros_of_servos_are_those_of_lerobot_s_calibration(tmp_path, unit):
+    (bus := Bus(dict.fromkeys(range(1, 7), 2100))).start()
+    motors = {f"m{i}": {"id": i, "drive_mode": 0, "homing_offset": 7, "range_min": 1000 + i, "range_max": 3000 + i}
+              for i in range(1, 7)}  # fmt: skip
+    (tmp_path / "motors.json").write_text(json.dumps(motors))
+    (tmp_path / "bus.toml").write_text(
+        f'port = "{bus.path}"\nids = [1, 2, 3, 4, 5, 6]\nangles = {{ unit = "{unit}", calibration = "motors.json" }}\n'
+    )
+    if unit != "counts":
+        with pytest.raises(aj.InputError, match="servos answer in counts"):
+            aj.live.open_device(f"servos:{tmp_path / 'bus.toml'}", SETUP)
+        return
+    device = aj.live.open_device(f"servos:{tmp_path / 'bus.toml'}", SETUP)
+    np.testing.assert_allclose(samples_of(device, 1)[-1].q, (100 - np.arange(1, 7)) * 2 * np.pi / 4096)
+    assert [source.split()[0] for source in device.sources] == ["motors.json"]
     device.close()
 
 

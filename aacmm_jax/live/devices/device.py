@@ -27,6 +27,7 @@ class AbstractDevice(abc.ABC):
         lines: How many lines, messages or images were read.
         bad: How many of these could not be used, by reason.
         read_as: Which of its readings is that of each joint, and in which direction (`Recording.read_as`).
+        sources: Files that its readings depend on (`Recording.sources`).
 
     Example:
         >>> class Resting(aj.live.AbstractDevice):
@@ -44,6 +45,7 @@ class AbstractDevice(abc.ABC):
     message: str = ""
     lines: int = 0
     read_as: tuple[int, ...] | None = None
+    sources: tuple[str, ...] = ()
     bad: Counter[str]
 
     def __init__(self, name: str):

@@ -6,12 +6,15 @@
 
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, NonNegativeInt, PositiveInt
 
 from ...core.errors import InputError, require
+from ...files.controllers.lerobot import angles_by_motors
+from ...files.inputs import InputFile, fingerprint
 from ...files.manifest_tables import Angles
 from ...files.toml import Strict, read_toml
 from ..places import Setup
@@ -53,8 +56,13 @@ class Servos(AbstractDevice):
     def __init__(self, where: str, bus: Bus, setup: Setup):
         super().__init__(f"servos:{where}")
         self._bus, self._arm, self._port, self._retry_at = bus, setup.specification.arm, None, 0.0
-        self.joints = len(bus.ids)
+        self.joints, self._angles = len(bus.ids), bus.angles
         self.read_as = bus.angles.read_as(self.joints)
+        if bus.angles.calibration is not None:
+            if bus.angles.unit != "counts":
+                raise InputError(f"{where}: servos answer in counts; write unit = 'counts' beside calibration.")
+            file = InputFile(Path(where).parent / bus.angles.calibration)
+            self._angles, self.sources = angles_by_motors(bus.angles, file, self.joints), (fingerprint(file),)
         usual = _ADDRESSES[bus.protocol]
         self._address, self._bytes = bus.address or usual[0], bus.bytes or usual[1]
         self._silent = 0
@@ -79,7 +87,7 @@ class Servos(AbstractDevice):
             self.message = "the servos do not answer; are they supplied?" if self._silent > 10 else ""
             return []
         self._silent, self.message = 0, ""
-        q = self._bus.angles.converted(np.array([counts], dtype=float), self._arm)[0]
+        q = self._angles.converted(np.array([counts], dtype=float), self._arm)[0]
         return [Sample(time.monotonic(), q)]
 
     def _position(self, servo: int) -> int | str:
