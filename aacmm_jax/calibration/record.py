@@ -105,6 +105,7 @@ class CalibrationRecord(NamedTuple):
     sampled_says: str | None = None
     robust: str | None = None  # the robust loss
     held_out: PoseResiduals | None = None  # residuals of poses that it was not calibrated with
+    held_out_nominal: np.ndarray | None = None  # distances of these poses by the nominal arm, mm
     removed: tuple[Removed, ...] = ()
     prior: PriorMetrics | None = None  # with arrays of NumPy
     noisy_encoders: tuple[NoisyEncoder, ...] = ()  # whose noise was estimated, because it is larger than expected

@@ -222,7 +222,8 @@ def _detected(
     from ..camera.detection import detect, overlay, preview, read_image
 
     paths = [Path(path) for path in glob.glob(str(Path(glob.escape(str(source.folder))) / pattern), recursive=True)]
-    names = natural_order([path.relative_to(source.folder).as_posix() for path in paths if path.is_file()])
+    beside = [path.relative_to(source.folder) if path.is_relative_to(source.folder) else path for path in paths]
+    names = natural_order([name.as_posix() for name, path in zip(beside, paths, strict=True) if path.is_file()])
     if not names:
         raise InputError(f"no image matches '{pattern}' in {source.folder}; check the path.")
     seen = []

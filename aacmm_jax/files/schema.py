@@ -143,6 +143,7 @@ CALIBRATION: Fields = {
     "decisions": text("what was decided by default"),
     "sampled_says": text("result of the Monte Carlo simulation"),
     "robust": text("robust loss"),
+    "held_out_nominal": number("distance of a held-out pose by the nominal arm", "mm", "held_out_pose"),
 }
 
 SAMPLED: Fields = {

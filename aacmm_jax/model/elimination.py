@@ -13,6 +13,7 @@ residuals, and the sum over its poses of squared distances from their centroid i
 """
 
 import itertools
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -185,11 +186,12 @@ def _shifts(block: RowBlock) -> Float[AnyArray, "h _"]:
     if block.by_own is None:
         # D = m: the outer product of the sum of the rows' derivatives, over m.
         shifts = sums_over_sockets(block.by_head, block.sizes) / np.sqrt(counts(block.sizes, 3))
-        return shifts.reshape(height, -1)
+        return shifts.reshape(height, math.prod(shifts.shape[1:]))  # without parameters: nothing, by so many
     sums = sums_by_component(block.by_own, xp.concatenate([block.by_own, block.by_head]), block.sizes)
     size = block.by_own.shape[0]
     # With D = L L^T: C^T D^-1 C = (L^-1 C)^T (L^-1 C).
-    return xp.moveaxis(inverse_cholesky(sums[..., :size]) @ sums[..., size:], -1, 0).reshape(height, -1)
+    shifts = xp.moveaxis(inverse_cholesky(sums[..., :size]) @ sums[..., size:], -1, 0)
+    return shifts.reshape(height, math.prod(shifts.shape[1:]))
 
 
 def _fitted(block: RowBlock) -> RowBlock:

@@ -95,7 +95,9 @@ def _numbers(summary: dict[str, Any], distances: dict[str, np.ndarray]) -> list[
         note = "" if predicted is None else f"predicted {predicted:.3g} mm"
         numbers.append(("Held-out groups, RMS distance", f"{validated['rms_mm']:.3g} mm", note))
     elif held_out is not None:
-        numbers.append(("Held-out poses, RMS distance", f"{held_out['held_out']['rms_mm']:.3g} mm", ""))
+        before, after = (held_out["held_out"][key] for key in ("rms_nominal_mm", "rms_mm"))
+        change, note = ("", "") if before is None else (f"{before:.3g} → ", "nominal → calibrated")
+        numbers.append(("Held-out poses, RMS distance", f"{change}{after:.3g} mm", note))
     else:
         numbers.append(("Poses", f"{summary['poses']}", "none held out"))
     return numbers

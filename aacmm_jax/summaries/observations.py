@@ -5,6 +5,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from ..calibration.evaluation import Evaluation
 from ..calibration.pose_table import HELD_OUT, USED, PoseResiduals
@@ -112,31 +113,37 @@ def observed_summary(record: CalibrationRecord, nominal: Evaluation) -> dict[str
         summary["base"] = _base_rows(record)
         summary["less_weight"] = less_weight(residuals)
     if record.held_out is not None:
-        summary["held_out_poses"] = _held_out_summary(record)
+        summary["held_out_poses"] = _held_out_summary(record, nominal)
     return summary
 
 
-def _held_out_summary(record: CalibrationRecord) -> dict[str, Any]:
-    """Distances of held-out poses from their geometry, all together and by observation, and those of the used poses."""
-    rows = residuals_of(record)
-    held_out, names = rows.used_as(HELD_OUT), np.array(rows.observation, dtype=object)
+def _held_out_summary(record: CalibrationRecord, nominal: Evaluation) -> dict[str, Any]:
+    """Distances of held-out poses from their geometry, all together and by observation, and those of the used poses;
+    where the arm was calibrated, by the nominal arm too."""
+    rows, by_nominal = residuals_of(record), record.held_out_nominal
+    used, held_out = rows.used_as(USED), rows.used_as(HELD_OUT)
+    of_used = None if by_nominal is None else np.concatenate(distances_of(record.recording.capture, nominal))
+    names = np.array(held_out.observation, dtype=object)
+    by_name = {name: names == name for name in dict.fromkeys(names)}
     return {
-        "held_out": distances_row(held_out),
-        "used": distances_row(rows.used_as(USED)),
+        "held_out": distances_row(held_out, by_nominal),
+        "used": distances_row(used, of_used),
         "observations": [
-            {"observation": name} | distances_row(rows.select(names == name).used_as(HELD_OUT))
-            for name in dict.fromkeys(held_out.observation)
+            {"observation": name}
+            | distances_row(held_out.select(mask), None if by_nominal is None else by_nominal[mask])
+            for name, mask in by_name.items()
         ],
     }
 
 
-def distances_row(rows: PoseResiduals) -> dict[str, Any]:
-    """RMS, mean and largest distance of poses from their geometry, and the RMS that is predicted, mm; and the RMS of
-    residuals that are no lengths."""
+def distances_row(rows: PoseResiduals, nominal: Float[np.ndarray, " m"] | None = None) -> dict[str, Any]:
+    """RMS, mean and largest distance of poses from their geometry, the RMS that is predicted, and that of the distances
+    by the nominal arm, mm; and the RMS of residuals that are no lengths."""
     known = np.isfinite(rows.distance)  # not of the only pose of a socket
     distance = rows.distance[known]
     row = {
         "poses": len(distance),
+        "rms_nominal_mm": None if nominal is None else rms(nominal[known]),
         "rms_mm": rms(distance),
         "mean_mm": float(distance.mean()) if len(distance) else None,
         "largest_mm": float(distance.max()) if len(distance) else None,
@@ -231,16 +238,25 @@ def robot_base_rows(record: CalibrationRecord) -> list[dict[str, Any]]:
 
 def _base_rows(record: CalibrationRecord) -> list[dict[str, Any]]:
     """The base frame as seen from each frame with known coordinates (an artefact's, a station's), k = 1."""
-    rows = {}
+    rows = []
+    for part in dict.fromkeys(frames_in_base(record).values()):
+        base, by = inverse_frame(np.asarray(record.observed.geometry[part]))
+        u = plain(np.sqrt(np.diag(by @ record.observed.geometry_covariance[part] @ by.T)))
+        position = {"in": part, "position_mm": base[3:].tolist(), "position_u_mm": u[3:]}
+        rows.append(position | {"rotation_rad": base[:3].tolist(), "rotation_u_rad": u[:3]})
+    return rows
+
+
+def frames_in_base(record: CalibrationRecord) -> dict[str, str]:
+    """The frames of stations, boards and placements in the base frame, as parts of the geometry, by the names of the
+    observations in them."""
+    frames = {}
     for observation in record.recording.capture.observations:
         part = getattr(observation, "frame", None)
         # A placement on a platform is not in the base.
         if part is not None and getattr(observation, "index", None) is None:
-            base, by = inverse_frame(np.asarray(record.observed.geometry[part]))
-            u = plain(np.sqrt(np.diag(by @ record.observed.geometry_covariance[part] @ by.T)))
-            position = {"in": part, "position_mm": base[3:].tolist(), "position_u_mm": u[3:]}
-            rows[part] = position | {"rotation_rad": base[:3].tolist(), "rotation_u_rad": u[:3]}
-    return list(rows.values())
+            frames[observation.name] = part
+    return frames
 
 
 def less_weight(residuals: tuple[ObservationResiduals, ...]) -> list[dict[str, Any]]:

@@ -299,10 +299,13 @@ def held_out_sentence(row: Mapping[str, Any]) -> str:
     """What poses that a calibration left out say of it (`observations.distances_row`), in words."""
     if row["rms_mm"] is None:
         return f"Held out: {pluralise(row['poses'], 'pose')}."
-    predicted = "" if row["rms_predicted_mm"] is None else f", predicted {row['rms_predicted_mm']:.3g} mm"
+    before, predicted = (
+        "" if row[key] is None else f"{row[key]:.3g} mm" for key in ("rms_nominal_mm", "rms_predicted_mm")
+    )
+    found = f"{before} nominal, {row['rms_mm']:.3g} mm calibrated" if before else f"{row['rms_mm']:.3g} mm"
     return (
-        f"Held out: {pluralise(row['poses'], 'pose')}; RMS distance from their geometry, as the other poses "
-        f"determine it, {row['rms_mm']:.3g} mm{predicted}, largest {row['largest_mm']:.3g} mm."
+        f"Held out: {pluralise(row['poses'], 'pose')}; RMS distance from their geometry, as the other poses determine "
+        f"it, {found}{predicted and f' (predicted {predicted})'}, largest {row['largest_mm']:.3g} mm."
     )
 
 

@@ -367,7 +367,8 @@ def test_residuals_are_written_pose_by_pose(aacmm, folder, tmp_path):
     assert summary["largest_mm"] == pytest.approx(held_out.max())
     shown = aacmm("show", "c.h5").stdout
     says = "RMS distance from their geometry, as the other poses determine it,"
-    assert f"Held out: 25 poses; {says} {summary['rms_mm']:.3g} mm, predicted" in " ".join(shown.split())
+    found = f"{summary['rms_nominal_mm']:.3g} mm nominal, {summary['rms_mm']:.3g} mm calibrated (predicted"
+    assert f"Held out: 25 poses; {says} {found}" in " ".join(shown.split())
     assert "--residuals" in aacmm("evaluate", "points.toml", "--residuals", "p.csv", expect=2).stderr
 
 

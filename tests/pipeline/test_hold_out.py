@@ -22,9 +22,9 @@ def arms():
     return nominal, aj.perturbed_arm(parameters, length=1.0, angle=0.001, seed=3)
 
 
-def recorded(arms, seed=0, observations=()):
+def recorded(arms, seed=0, observations=(), lengths=LENGTHS):
     nominal, true = arms
-    capture = aj.simulate(true, SOCKETS, poses=20, lengths=LENGTHS, observations=observations, noise=NOISE, seed=seed)
+    capture = aj.simulate(true, SOCKETS, poses=20, lengths=lengths, observations=observations, noise=NOISE, seed=seed)
     specification = aj.kinematics.ArmSpecification(nominal, "arm")
     return aj.Recording(capture, specification)
 
@@ -122,6 +122,22 @@ def test_a_group_that_was_held_out_tests_the_uncertainty(arms):
     assert len(group.length_error) == 1
     rows = aj.residuals_of(record).used_as("held out")
     assert group.rms == pytest.approx(np.sqrt(np.mean(rows.distance**2)), rel=0.02)
+
+
+@pytest.mark.slow
+def test_the_nominal_arm_is_tested_as_by_a_calibration_with_the_arm_held(arms, tmp_path):
+    """Sockets by the centroid of their used poses; without lengths, which a held arm would not divide by."""
+    recording = recorded(arms, observations=(TRACKER,), lengths=())
+    held = recording.nominal._replace(held=tuple(aj.kinematics.parameter_names(arms[0])))
+    record, of_held = (
+        aj.calibrate_capture(part, noise=NOISE, automatic=False, hold_out=0.3)
+        for part in (recording, recording._replace(nominal=held))
+    )
+    assert np.allclose(record.held_out_nominal, of_held.held_out.distance, rtol=1e-6)
+    assert np.sqrt(np.mean(record.held_out_nominal**2)) > 20 * np.sqrt(np.mean(record.held_out.distance**2))
+    assert of_held.held_out_nominal is None  # nothing was calibrated
+    aj.files.save_calibration(tmp_path / "c.h5", record)
+    assert np.array_equal(aj.files.load_calibration(tmp_path / "c.h5").held_out_nominal, record.held_out_nominal)
 
 
 @pytest.mark.slow
