@@ -6,6 +6,7 @@ import json
 import math
 import os
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from importlib import metadata
 from importlib.machinery import SourceFileLoader
@@ -37,6 +38,17 @@ class _Commands(typer.core.TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         with _said_in_short():
             return super().invoke(ctx)
+
+
+class _Command(typer.core.TyperCommand):
+    """A command whose options of one value are given at most once: click would take the last and drop the others."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        given = self.make_parser(ctx).parse_args(args=list(args))[2]
+        for parameter, times in Counter(given).items():
+            if times > 1 and parameter.param_type_name == "option" and not parameter.multiple:
+                raise InputError(f"{parameter.opts[0]} is given {times} times, but has one value; give it once.")
+        return super().parse_args(ctx, args)
 
 
 @contextlib.contextmanager
@@ -115,7 +127,7 @@ def command(*typed: str, name: str | None = None) -> Callable[[Any], Any]:
             unit = parameter.rpartition("_")[2]
             if unit in ("mm", "deg", "arcsec") and value.default.metavar is None:
                 value.default.metavar = unit.upper()
-        return app.command(name, epilog=examples(*typed))(function)
+        return app.command(name, cls=_Command, epilog=examples(*typed))(function)
 
     return register
 

@@ -181,7 +181,7 @@ def checked_recording(
     from ..files.reading_checks import positions_unit, rotation_rows
     from ..pipeline.reading_sets import compare_points, compare_reading_sets, points_sentence, reading_sets_sentence
 
-    check = with_spinner("Comparing", lambda: check_capture(specification.arm, recording.capture))
+    check = with_spinner("Comparing", lambda: check_capture(specification.arm, recording.capture, recording.usual))
     unit = "rad" if manifest is None else None
     of_file = {"nominal": recording.nominal, "manifest": manifest}
     summary = _check_summary(specification, check, recording.capture, unit, positions_unit(manifest), **of_file)

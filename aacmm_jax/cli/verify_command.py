@@ -48,7 +48,8 @@ def verify(
     The position of the tool tip, the frames of instruments and the positions of sockets are unknown and are fitted.
 
     The verdict is a two-sided test at the 5 % level, and "no difference that matters" (errors over the working volume
-    that differ by less than 30 % of the larger) two one-sided tests. The exit code is 1 if the delivered parameters
+    that differ by less than 30 % of the larger) two one-sided tests. If the data do not match
+    the arm (as aacmm calibrate tests it), there is no verdict. The exit code is 1 then, and if the delivered parameters
     are worse, or not good.
     """
     from ..pipeline.verification import verify as run
@@ -72,7 +73,7 @@ def verify(
         write_verification(output, checked, measured, summary, sources=list(sources))
         summary["written"] = str(output)
     show_summary(summary, as_json, summaries.verification.verification)
-    if checked.verdict in ("worse", "not good"):
+    if checked.mismatch or checked.verdict in ("worse", "not good"):
         raise typer.Exit(1)
 
 

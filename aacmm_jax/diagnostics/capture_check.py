@@ -8,13 +8,14 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..data.capture import Capture
+from ..data.noise import ArmNoise
 from ..data.observations.measured import MeasuredPoints
 from ..kinematics.arm import Arm
 from ..kinematics.corrections import coefficient_of
 from ..kinematics.robots import chains_of
 from .camera_points import axes_of_cameras, with_points_of_cameras
 from .hand_eye_search import hand_eye_hypotheses
-from .reading_check import EXPLAINED, NEVER, ReadingCheck, checked_fit, possible_units, reading_fit
+from .reading_check import NEVER, ReadingCheck, checked_fit, possible_units, reading_fit
 from .reading_fit import ReadingFit
 from .reading_search import Hypothesis
 
@@ -23,29 +24,30 @@ _NO_ZERO = 2e-3  # rad: what two zeros that cancel each other may leave
 _LESS = 0.8  # of the residual: what each of several couplings must leave at most
 
 
-def check_capture(arm: Arm, capture: Capture) -> ReadingCheck:
+def check_capture(arm: Arm, capture: Capture, usual: ArmNoise | None = None) -> ReadingCheck:
     """`check_readings` of what was recorded in sockets, or as one station of an instrument or a camera saw it; where no
-    order, signs and zeros explain it, couplings of joints are tried. Of a robot, of the first chain whose readings do
+    order, signs and zeros explain it, couplings of joints are tried. ``usual``: the noise that is usual for the arm, by
+    which more may be left unexplained. Of a robot, of the first chain whose readings do
     not fit, with the chain's own numbers of its joints."""
     if arm.chains:
-        checks = [check_capture(*part) for part in _by_chain(arm, capture)]
+        checks = [check_capture(*part, usual) for part in _by_chain(arm, capture)]
         return next((check for check in checks if not check.explained), checks[0])
-    fit = reading_fit(arm, **_evidence_of(arm, capture))
+    fit = reading_fit(arm, **_evidence_of(arm, capture), usual=usual and usual.noise)
     check = checked_fit(fit, _by_cameras(fit, capture))
     return check if check.explained else _with_couplings(check, fit)
 
 
-def fits_as_recorded(arm: Arm, capture: Capture) -> bool:
+def fits_as_recorded(arm: Arm, capture: Capture, usual: ArmNoise | None = None) -> bool:
     """Whether the readings fit an arm whose parameters differ from nominal ones as those of real arms do, so that no
     other order, signs and zeros have to be searched, which takes seconds. Raises `InputError` as `check_capture`
     does."""
     if arm.chains:
-        return all(fits_as_recorded(*part) for part in _by_chain(arm, capture))
-    fit = reading_fit(arm, **_evidence_of(arm, capture))
+        return all(fits_as_recorded(*part, usual) for part in _by_chain(arm, capture))
+    fit = reading_fit(arm, **_evidence_of(arm, capture), usual=usual and usual.noise)
     as_recorded = _plain(fit)
     residual, with_zeros = fit.explanation(as_recorded).rms_fitted, fit.with_free_zeros(as_recorded)[1]
     possible = float(np.abs(fit.evidence.q).max()) <= NEVER
-    return possible and residual <= EXPLAINED * fit.size and residual <= fit.as_good_as(with_zeros)
+    return possible and residual <= fit.explained and residual <= fit.as_good_as(with_zeros)
 
 
 def _by_chain(robot: Arm, capture: Capture) -> list[tuple[Arm, Capture]]:
@@ -118,7 +120,7 @@ def search_couplings(arm: Arm, capture: Capture) -> dict[str, float]:
 
 
 def _couplings(fit: ReadingFit) -> dict[str, float]:
-    enough, couplings = EXPLAINED * fit.size, {}
+    enough, couplings = fit.explained, {}
     residual = fit.with_free_zeros(_plain(fit))[1]
     if residual <= enough:
         return {}
@@ -171,7 +173,7 @@ def _with_couplings(check: ReadingCheck, fit: ReadingFit) -> ReadingCheck:
         good = [one for one in found if one[0] <= fit.as_good_as(least)]
         few = min(mistake.changes for _, mistake, _ in good)
         best = [one for one in good if one[1].changes == few]
-        if least > EXPLAINED * fit.size or len(best) > 1:
+        if least > fit.explained or len(best) > 1:
             return check
         _, hypothesis, couplings = best[0]
     q, pairs = hypothesis.readings(fit.evidence.q), []

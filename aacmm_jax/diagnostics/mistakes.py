@@ -102,7 +102,7 @@ def checked_readings(case: Case) -> ReadingCheck | None:
     if len(capture.readings) > _CHECKED:
         capture = draw_poses(capture, _CHECKED)
     try:
-        return check_capture(recording.nominal.arm, capture)
+        return check_capture(recording.nominal.arm, capture, recording.usual)
     except InputError:  # neither two poses in a socket nor measured points
         return None
 

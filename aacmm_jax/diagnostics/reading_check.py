@@ -21,6 +21,7 @@ from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.text import listed
 from ..core.units import DEG, INCH, LENGTH_UNITS, M, length_unit
+from ..data.noise import Noise
 from ..kinematics.arm import Arm, is_single, joint_limits
 from ..kinematics.corrections import coefficient_of
 from ..kinematics.jacobian import tip_position
@@ -29,7 +30,6 @@ from .joint_travel import standing_joints
 from .reading_fit import Explanation, ReadingFit
 from .reading_search import Evidence, Hypothesis, search
 
-EXPLAINED = 0.003  # of the arm's size: a smaller residual is left by a nominal arm, once its parameters are adjusted
 _REFITTED = 24  # hypotheses
 _EQUAL = 1e-6, 2e-4  # of a residual, and mm: the same cost but for rounding
 _LISTED = 200  # hypotheses of equal cost that are looked at
@@ -122,8 +122,10 @@ def reading_fit(
     rotations: Float[AnyArray, "poses 3 3"] | None = None,
     own_frame: bool = False,
     free_tip: bool = False,
+    usual: Noise | None = None,
 ) -> ReadingFit:
-    """What hypotheses are compared by; the arguments are those of `check_readings`."""
+    """What hypotheses are compared by; the arguments are those of `check_readings`, and the noise that is usual for
+    arms of this class."""
     arm = to_numpy(arm)
     if not is_single(arm):
         raise InputError("check_readings takes one arm, not a batch; give one arm of the batch.")
@@ -145,7 +147,7 @@ def reading_fit(
             raise InputError("no socket has two poses, so nothing can be compared; record more poses in a socket.")
         order = np.argsort(owner, kind="stable")
         evidence = Evidence(q[order], owner[order])
-    return ReadingFit(arm, evidence, max(total_link_length(arm), 1e-9), free_tip)
+    return ReadingFit(arm, evidence, max(total_link_length(arm), 1e-9), free_tip, usual)
 
 
 def checked_fit(fit: ReadingFit, likely: Sequence[Hypothesis] = ()) -> ReadingCheck:
@@ -173,7 +175,7 @@ def checked_fit(fit: ReadingFit, likely: Sequence[Hypothesis] = ()) -> ReadingCh
     good = [(members, fit.needed_zeros(members[0], zeros, rms)) for members, zeros, rms in candidates if rms <= bound]
     explanations = [explanation for _, explanation in good] + [given] * (possible and given.rms_fitted <= bound)
     closest = min(explanations, key=lambda explanation: explanation.rms_fitted)
-    explained, best, others, equal = closest.rms_fitted <= EXPLAINED * fit.size, closest, (), 0
+    explained, best, others, equal = closest.rms_fitted <= fit.explained, closest, (), 0
     if explained:
         simplest = (_with_common_zero(fit, explanation) for explanation in explanations)
         best = min(simplest, key=lambda x: (x.outside > 0, x.changes, x.rms_fitted))

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from ..core.numpy_or_jax import to_numpy
 from ..core.rotations import fitted_frame, rotation_matrix
 from ..core.units import DEG
+from ..data.noise import Noise, at_tip
 from ..kinematics.arm import Arm, by_joint, is_length, joint_limits, locate, parameter_names, value_of, with_values
 from ..kinematics.chain import forward_pass, joint_motion
 from ..kinematics.jacobian import rotation_columns, stacked_jacobian_columns
@@ -19,6 +20,9 @@ from .reading_search import Evidence, Hypothesis
 _LENGTH, _PROBE, _TWIST, _TIP = 0.004, 0.03, 0.5 * DEG, 5e-4
 _TIGHT, _FREE = 1.5 * DEG, math.pi / 2  # likewise of zeros
 _ZERO = 4 * DEG  # a smaller error of a zero is left to calibration
+# Residuals that a real arm leaves once its parameters are adjusted: a part of its size, or, where that is more, so many
+# times what the noise of its class moves a tip at full reach.
+_EXPLAINED, _SCATTER = 0.003, 3.0
 _STEPS = 20
 _FITTED = 120, 24  # poses of a fit, in all and in one socket
 _MARGIN = 3 * DEG  # of readings beyond their limits
@@ -64,8 +68,11 @@ class Explanation(NamedTuple):
 class ReadingFit:
     """Residuals of hypotheses, with nominal and with adjusted parameters."""
 
-    def __init__(self, arm: Arm, evidence: Evidence, size: float, free_tip: bool):
+    def __init__(self, arm: Arm, evidence: Evidence, size: float, free_tip: bool, usual: Noise | None = None):
         self.arm, self.evidence, self.size, self.lever, self.free_tip = arm, evidence, size, size / 4, free_tip
+        # A smaller residual is left by a real arm, once its parameters are adjusted.
+        scatter = 0.0 if usual is None else math.sqrt(3) * math.hypot(*at_tip(usual, arm, size))
+        self.explained = max(_EXPLAINED * size, _SCATTER * scatter)
         self._few = evidence.thinned(*_FITTED)
         names = parameter_names(arm)
         self._nominal = np.array([value_of(arm, name) for name in names], dtype=float)
@@ -128,7 +135,7 @@ class ReadingFit:
             if changed.rms_fitted <= _NEARLY * rms + _EXACT * self.size or not waiting:
                 return changed
             joint = waiting.pop(0)
-            offsets[joint] = _rounded(offsets[joint] + zeros[joint])
+            offsets[joint] = _rounded(float(offsets[joint]) + float(zeros[joint]))
 
     def with_fitted_zeros(self, hypothesis: Hypothesis) -> tuple[Hypothesis, Float[np.ndarray, " n"], float]:
         """The hypothesis with the zeros that fit best, but for those of the first and the last joint, which base and

@@ -71,7 +71,7 @@ def camera_fits(recording: Recording) -> bool:
     if not any(isinstance(part, Pixels) for part in recording.capture.observations):
         return True
     try:
-        return fits_as_recorded(recording.nominal.arm, recording.capture)
+        return fits_as_recorded(recording.nominal.arm, recording.capture, recording.usual)
     except InputError:  # too few poses
         return True
 
@@ -89,9 +89,9 @@ def with_corrected_readings(
         return record, None
     recording = record.recording
     try:
-        if fits_as_recorded(recording.nominal.arm, recording.capture):
+        if fits_as_recorded(recording.nominal.arm, recording.capture, recording.usual):
             return record, None
-        check = check_capture(recording.nominal.arm, recording.capture)
+        check = check_capture(recording.nominal.arm, recording.capture, recording.usual)
     except InputError:  # neither sockets nor points, or too few
         return record, None
     best = check.best
@@ -144,7 +144,7 @@ def with_readings_of_arm(
         return capture, ()
     try:
         # By the nominal arm, for which explanations that are the same by its symmetry are one.
-        check = check_capture(record.recording.nominal.arm, capture)
+        check = check_capture(record.recording.nominal.arm, capture, record.recording.usual)
     except InputError:  # neither sockets nor points, or too few
         return capture, ()
     best, corrected = check.best, corrected_capture(capture, check.best)

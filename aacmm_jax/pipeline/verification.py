@@ -21,6 +21,9 @@ Delivered parameters that are the nominal ones have nothing to be compared with 
 where, at 5 %, a calibration with these poses would leave less than `MARGIN` of their error over the working volume in
 the posterior about them. They are "good" where it is expected to leave more, and that error is no larger than the RMS
 error that these poses show may be: else the poses say too little of the working volume.
+
+No verdict is given where the data do not match the arm: where `calibrate_capture` calls a calibration with these poses
+unusable, or corrects their readings or leaves poses out as mixed up. Its tests are the only ones of that.
 """
 
 import math
@@ -52,6 +55,7 @@ from ..kinematics.arm import (
 )
 from ..kinematics.parameters import ArmSpecification, Bounds, Parameters
 from ..uncertainty.linearisation import Linearisation
+from .data_match import data_mismatch
 
 VerdictHere = Literal["better", "worse", "not decided"]
 Verdict = Literal["better", "worse", "equivalent", "good", "not good", "not decided"]
@@ -121,6 +125,8 @@ class Verification(NamedTuple):
     ratio_upper: float
     verdict_here: VerdictHere  # for poses such as these
     same: bool  # whether the two arms do not differ in these poses
+    mismatch: str = ""  # why the data do not match the arm, so that there is no verdict; empty where they do
+    warnings: tuple[str, ...] = ()  # of what was recorded, and of this mismatch
 
     @property
     def gain(self) -> float:
@@ -139,7 +145,8 @@ def verify(recording: Recording, delivered: ArmSpecification | Arm | None = None
     of the larger; else "not decided". What the poses do not show of the working volume counts against any verdict.
     Parameters that are the nominal ones are "not good" if, by a one-sided test at 5 %, a calibration with these poses
     would leave less than 70 % of their error over the working volume. They are "good" if it is expected to leave more,
-    and the expected error there is no larger than the upper limit of the RMS error in these poses.
+    and the expected error there is no larger than the upper limit of the RMS error in these poses. Data that do not
+    match the arm, by the tests of `calibrate_capture`, get no verdict.
 
     Args:
         recording: poses in sockets, on a board, or seen by a tracker; its nominal arm is the one to compare with.
@@ -192,8 +199,11 @@ def verify(recording: Recording, delivered: ArmSpecification | Arm | None = None
     ratios = np.array([np.quantile(r, (LEVEL, 1 - LEVEL)) for r in (from_nominal.ratio, 1 / from_delivered.ratio)])
     lower, upper = float(ratios[:, 0].min()), float(ratios[:, 1].max())
     sure = {"better": from_nominal.probability, "worse": from_delivered.probability, "not decided": 0.0}
+    mismatch, said = data_mismatch(recording)
     verdict: Verdict = "not decided"
-    if sure[paired.verdict] > 1 - LEVEL / 2:
+    if mismatch:
+        pass
+    elif sure[paired.verdict] > 1 - LEVEL / 2:
         verdict = paired.verdict
     elif not paired.same and lower >= MARGIN and upper <= 1 / MARGIN:
         verdict = "equivalent"
@@ -223,6 +233,8 @@ def verify(recording: Recording, delivered: ArmSpecification | Arm | None = None
         ratio_upper=upper,
         verdict_here=paired.verdict,
         same=paired.same,
+        mismatch=mismatch,
+        warnings=said,
     )
 
 

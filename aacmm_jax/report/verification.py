@@ -28,16 +28,17 @@ def verification_report(checked: Verification, capture: Capture, summary: dict[s
     volume = ("Expected over the working volume", f"{checked.volume:.2g} mm", "RMS, as delivered")
     found, not_tested = (summary["poses_say"], summary["gain_says"]), "; ".join(summary["not_tested"])
     left = f"over the working volume, in place of {checked.volume:.2g} mm"
+    calibrated = ("After a calibration with these poses", f"at least {checked.recalibrated:.2g} mm", left)
     return Report(
         title=f"Verification of delivered parameters, {summary['arm'] or 'an arm'}",
         subtitle=f"{counted(summary)} Delivered: {summary['delivered']}",
         verdict=summary["says"],
         verdict_mark=VERDICT_MARKS.get(summary["verdict"], "unsure"),
-        warnings=[],
+        warnings=summary["warnings"],
         numbers=[
             *errors,
-            *([volume] if checked.same else []),
-            ("After a calibration with these poses", f"at least {checked.recalibrated:.2g} mm", left),
+            *([volume] if checked.same and not checked.mismatch else []),
+            *([] if checked.mismatch else [calibrated]),
         ],
         picture=picture._replace(table=None),
         one_page=True,

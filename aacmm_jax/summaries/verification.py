@@ -5,7 +5,7 @@ from typing import Any
 from ..core.text import pluralise
 from ..pipeline.verification import LEVEL, MARGIN, Accuracy, Verification
 from ..uncertainty.coverage import LEVEL_IN_PERCENT, U_AT_LEVEL
-from .tables import STYLES, Styled, Table, View, listed, plain
+from .tables import STYLES, Styled, Table, View, listed, plain, warnings_of
 
 VERDICT_MARKS = {"better": "good", "good": "good", "worse": "bad", "not good": "bad", "equivalent": "neutral"}
 _LITTLE = 0.1  # of the RMS error: a smaller gain of a recalibration is none
@@ -50,6 +50,8 @@ def verification_summary(checked: Verification, arm: str, delivered: str, scaled
         "recalibrated_rms_mm": checked.recalibrated,
         "gain_mm": checked.gain,
         "gain_says": _gain(checked),
+        "warnings": list(checked.warnings),
+        "data_match": not checked.mismatch,
         "not_tested": [*_NOT_TESTED, *([] if scaled else ["the scale of the arm: no length is known"])],
     }
 
@@ -75,6 +77,8 @@ def _accuracy(accuracy: Accuracy) -> dict[str, Any]:
 def _verdict(checked: Verification) -> str:
     nominal, delivered = checked.nominal, checked.delivered
     of_delivered = f"{delivered.rms:.3g} mm RMS ({LEVEL_IN_PERCENT}: {delivered.lower:.3g} to {delivered.upper:.3g} mm)"
+    if checked.mismatch:
+        return f"Not decided: {checked.mismatch} ({of_delivered} with the delivered parameters and the tip fitted)."
     if checked.same:
         left = {
             "good": f"a calibration with these poses would gain less than {1 - MARGIN:.0%}",
@@ -102,6 +106,8 @@ def _verdict(checked: Verification) -> str:
 
 def _poses(checked: Verification) -> str:
     """How many poses decide."""
+    if checked.mismatch:
+        return "Correct the recording or the manifest first (see the warnings), then verify again."
     errors = f"(of two equally good sets, {50 * LEVEL:g} % are called better and {50 * LEVEL:g} % worse)"
     if checked.same:
         alone = "The delivered parameters are the nominal ones, so that they are compared with a calibration only."
@@ -128,7 +134,9 @@ def _poses(checked: Verification) -> str:
 
 
 def _gain(checked: Verification) -> str:
-    """What a recalibration gains."""
+    """What a recalibration gains; nothing where the data do not match the arm."""
+    if checked.mismatch:
+        return ""
     volume = f"Over the working volume, the delivered parameters are expected to err by {checked.volume:.2g} mm RMS"
     if not checked.same:
         volume += f", {checked.ratio_lower:.2g} to {checked.ratio_upper:.2g} times as much as the nominal ones (90 %)"
@@ -175,6 +183,7 @@ def verification(summary: dict[str, Any]) -> View:
     """What people see of it."""
     yield Styled(summary["says"], STYLES[VERDICT_MARKS.get(summary["verdict"], "unsure")])
     yield from filter(None, (summary["poses_say"], summary["gain_says"]))
+    yield from warnings_of(summary)
     yield accuracy_table(summary)
     yield counted(summary)
     yield meaning(summary)

@@ -144,6 +144,19 @@ def test_bad_input_is_exit_code_2_and_one_sentence(aacmm, tmp_path, arguments, m
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("arguments", "option"),
+    [
+        (("calibrate", "c.h5", "--hold-out", "A", "--hold-out", "B"), "--hold-out"),
+        (("calibrate", "c.h5", "-o", "a.h5", "--output", "b.h5"), "--output"),
+        (("calibrate", "c.h5", "--automatic", "--no-automatic"), "--automatic"),
+        (("evaluate", "c.h5", "d.h5", "--max-rms-mm=1", "--max-rms-mm", "2"), "--max-rms-mm"),
+    ],
+)
+def test_an_option_of_one_value_given_twice_is_refused(aacmm, arguments, option):
+    assert f"{option} is given 2 times, but has one value" in aacmm(*arguments, expect=2).stderr
+
+
 def test_debug_shows_the_traceback(aacmm_process):
     assert "Traceback" in aacmm_process("calibrate", "none.h5", "-o", "x.h5", "--debug", expect=1).stderr
 

@@ -54,6 +54,25 @@ def test_a_good_and_a_bad_delivery(aacmm, robot):
     assert "as_found" in aacmm("verify", "poses.toml", expect=2).stderr
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("unit", "length", "warning"), [("deg", "100.0", "read as degrees"), ("rad", "1000.0", "The scale factor")]
+)
+def test_data_that_do_not_match_the_arm_get_no_verdict(aacmm, robot, unit, length, warning):
+    """As found by hand: a wrong unit or length was "good", since a calibration did not gain much either."""
+    manifest = (robot / "poses.toml").read_text("utf-8")
+    for path in robot.glob("socket_*.csv"):
+        path.write_text(path.read_text("utf-8").replace("[rad]", f"[{unit}]"), "utf-8")
+    (robot / "poses.toml").write_text(manifest.replace("value = 100.0", f"value = {length}"), "utf-8")
+    printed = aacmm("verify", "poses.toml", "--delivered", "nominal.toml", "-o", "page.html", expect=1).stdout
+    page = (robot / "page.html").read_text("utf-8")
+    assert printed.startswith("Not decided: ")
+    for text in (printed, page):
+        assert warning in " ".join(text.split())
+    assert "<b>Not decided</b>" in page
+    assert "After a calibration" not in page
+
+
 def test_a_plate_is_made_with_the_lines_of_its_manifest(aacmm, tmp_path):
     printed = aacmm("sockets", "-o", "plate.stl", "--drawing", "plate.pdf", "--distance-mm", 80).stdout
     assert (tmp_path / "plate.pdf").read_bytes().startswith(b"%PDF")

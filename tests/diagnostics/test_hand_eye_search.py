@@ -61,7 +61,15 @@ def test_readings_of_lerobot_whose_zeros_and_first_sign_are_not_the_model_s(tmp_
     path = tmp_path / "arm.toml"
     path.write_text(MANIFEST.format(folder=(EXAMPLES / "webcam").as_posix()))  # elsewhere: images have whole paths
     recording = aj.files.read_manifest(path)
-    check = check_capture(recording.nominal.arm, recording.capture)
+    check = check_capture(recording.nominal.arm, recording.capture, recording.usual)
     assert (check.explained, check.best.signs, check.others) == (True, (-1, 1, 1, 1, 1), ())
     np.testing.assert_allclose(np.degrees(check.best.offsets), [0, 100.4, -90.7, -37.3, 0], atol=1.5)
     assert check.best.rms_fitted < 0.5
+    # With the play of hobby servos, too; but not of an arm of which nothing is known.
+    (seen,) = recording.capture.observations
+    scattered = np.asarray(seen.q) + np.radians(0.6) * np.random.default_rng(1).normal(size=seen.q.shape)
+    capture = aj.Capture({}, observations=[seen.changed(q=scattered)])
+    check = check_capture(recording.nominal.arm, capture, recording.usual)
+    assert (check.explained, check.best.signs) == (True, (-1, 1, 1, 1, 1))
+    np.testing.assert_allclose(np.degrees(check.best.offsets), [0, 100.4, -90.7, -37.3, 0], atol=10)
+    assert not check_capture(recording.nominal.arm, capture).explained
