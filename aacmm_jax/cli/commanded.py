@@ -82,6 +82,44 @@ def at_temperature(commanded: Any, calibrated: Any, temperature: float | None) -
     return calibrated.beside.laid_out(np.hstack([commanded.q, recorded]), ("thermometer",))
 
 
+def names_of_frames(record: Any) -> dict[str, str]:
+    """The frames that ``--in-frame`` may name, as parts of the geometry: by the name of the station, board or
+    placement, or of an observation."""
+    from ..summaries.observations import frames_in_base
+
+    frames = frames_in_base(record)
+    return {part.removeprefix("frame of ").removeprefix("placement "): part for part in frames.values()} | frames
+
+
+def named_frame(record: Any, name: str) -> np.ndarray:
+    """The frame that ``--in-frame`` names: takes positions in it to the first frame of the arm; 4 x 4, mm."""
+    from ..calibration.reprojection import frame_of
+
+    names = names_of_frames(record)
+    if name not in names:
+        known = ", ".join(map(printable, names)) or "none"
+        raise InputError(f"--in-frame {name} is not a frame of the calibration; give one of its frames ({known}).")
+    return frame_of(np.asarray(record.observed.geometry[names[name]]))
+
+
+def targets_words(record: Any, commanded: Any, name: str | None) -> str:
+    """What the targets were taken to be: poses of the nominal arm, or positions in a frame."""
+    other, frame = "", printable(next(iter(names_of_frames(record)), ""))
+    if frame and name is None:
+        other = f" If the targets are positions in the frame of {frame}, give --in-frame {frame}."
+    if commanded.poses is None:
+        return f"Targets: the poses that the nominal arm has in its base frame at the readings of the table.{other}"
+    table = commanded.table
+    columns = [table.header[i] if table.header else str(i + 1) for i in commanded.position]
+    where = "the base frame" if name is None else f"the frame of {printable(name)}"
+    begin = "of the table" if commanded.columns else "given by --near"
+    kept = "" if commanded.oriented else ", whose orientation on the nominal arm is kept"
+    return (
+        f"Targets: positions (columns {', '.join(map(printable, columns))}) in {where}; the search starts from the "
+        f"readings {begin}{kept}.{other}"
+    )
+
+
 def in_first_frame(record: Any, poses: np.ndarray) -> np.ndarray:
     """Poses in the frame in which the Denavit-Hartenberg chain begins; of a URDF they are given in its base link."""
     urdf = record.recording.nominal.urdf

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..core.errors import InputError
-from ..core.text import csv_text, is_number, quoted
+from ..core.text import csv_text, is_number, pluralise, quoted
 from ..core.units import ANGLE_UNITS, DEG, LENGTH_UNITS
 from ..kinematics.arm import Arm, by_joint
 from .text_lines import SI, Column, are_numbered, bare_name, stem_and_number
@@ -190,6 +190,13 @@ def position_columns(table: TextTable) -> tuple[list[int], str | None] | None:
     return next(filter(None, choices), None)
 
 
+def _stated_positions(table: TextTable, columns: Sequence[Column]) -> tuple[list[int], str | None]:
+    picked = table.pick(columns)
+    if len(picked) != 3:
+        raise InputError(f"{table.path}: {len(picked)} columns are picked for the positions; pick three, x, y and z.")
+    return picked, table.unit(picked, key="points")
+
+
 def header_units(text: TextTable, picked: Sequence[int], arm: Arm, stated: str | None) -> tuple[str | None, str | None]:
     """The units that the header states for readings of revolute and of prismatic joints, or None; ``stated``: that of
     the former in the manifest. Raises `InputError` where it states units of something else."""
@@ -227,6 +234,7 @@ class PoseTable(NamedTuple):
     arm: Arm
     table: TextTable
     columns: tuple[int, ...]  # of the readings, counted from 0; none: `near` was used
+    position: tuple[int, ...]  # columns of the positions, counted from 0
     temperature: Float[np.ndarray, " N"] | None  # C
 
 
@@ -237,6 +245,7 @@ def read_poses(
     unit: str | None = None,
     near: Sequence[float] | None = None,
     columns: Sequence[Column] | None = None,
+    positions: Sequence[Column] | None = None,
     length_unit: str | None = None,
     recorded: bool = False,
 ) -> PoseTable:
@@ -244,10 +253,10 @@ def read_poses(
 
     Of commanded poses: either joint readings, in columns named q_1, q_2, ... (or q1, joint_1, j1, a1; with a unit, as
     q_1_deg, if the header states it), or in all columns of a table without such names, or in ``columns``. Or positions
-    and orientations: x, y, z (mm, or the header's unit; or px, py, pz) with qw, qx, qy, qz (quaternion) or rx, ry, rz
-    (rotation vector, in ``unit`` unless the header says it), and the readings to begin with in columns as above, or
-    ``near``; with ``near`` also positions alone, whose orientation the caller chooses. A column temperature_C
-    is the arm's.
+    x, y, z (mm, or the header's unit; or px, py, pz, or in the columns ``positions``), with or without an orientation:
+    qw, qx, qy, qz (quaternion) or rx, ry, rz (rotation vector, in ``unit`` unless the header says it), and the readings
+    to begin with in columns as above, or ``near``. The caller chooses the orientation of positions alone. A column
+    temperature_C is the arm's.
 
     Of poses that were ``recorded``: joint readings, and the position of the tip, perhaps with its orientation; without
     positions all poses are of one socket, or of those that a column ``socket`` names. A table without header has a
@@ -257,7 +266,7 @@ def read_poses(
     to a revolution are in rad otherwise. ``length_unit``: of positions whose header states none, by default mm.
     """
     table, joints = TextTable(path), arm.joints
-    position = position_columns(table)
+    position = position_columns(table) if positions is None else _stated_positions(table, positions)
     orientation = find_named(table, _QUATERNION) or find_named(table, _ROTATION, tuple(_ANGLES))
     if recorded and not table.header and table.width in (joints, joints + 3):
         picked, after = list(range(joints)), list(range(joints, table.width))
@@ -274,9 +283,16 @@ def read_poses(
             f"the header of {path} states {header} for the joint readings; give the readings in deg or rad, and omit "
             "--unit."
         )
-    if bool(picked) == (near is not None):
+    if picked and near is not None:
+        found = quoted(table.header[picked[0]]) if table.header else f"number {picked[0] + 1}"
         raise InputError(
-            f"{path} needs exactly one source of joint readings; give either columns q_1 to q_{joints} or --near."
+            f"{path} has joint readings in {pluralise(joints, 'column')} (the first is {found}), and --near gives "
+            "readings too; leave out --near, or the columns."
+        )
+    if not picked and near is None:
+        raise InputError(
+            f"{path} has positions, but no joint readings that the search starts from; add columns q_1 to q_{joints}, "
+            "name the columns of the readings with --columns, or give --near."
         )
     if near is not None and len(near) != joints:
         raise InputError(
@@ -289,18 +305,19 @@ def read_poses(
     if unit is None:
         raise InputError(f"{path} does not state the unit of the joint readings; give --unit deg or --unit rad.")
     poses = None
-    if orientation is not None or ((recorded or near is not None) and position is not None):
+    if orientation is not None or position is not None:
         poses = _poses(table, _ANGLES[unit], position, orientation or ([], None), length_unit)
     return PoseTable(
         np.array(by_joint(arm, _ANGLES[unit], 1.0)) * readings,
         poses,
         orientation is not None,
         unit,
-        "mm" if position is None else position[1] or "mm",
+        "mm" if position is None else position[1] or length_unit or "mm",
         tuple(table.texts("socket")) if table.header and table.has(["socket"]) else ("A",) * table.length,
         arm,
         table,
         tuple(picked),
+        () if position is None else tuple(position[0]),
         table.numbers(table.pick([TEMPERATURE]))[:, 0] if table.has([TEMPERATURE]) else None,
     )
 
@@ -323,9 +340,9 @@ def corrected_poses_csv(
     from scipy.spatial.transform import Rotation
 
     table, unit = commanded.table, commanded.unit
-    position, quaternion, vector = position_columns(table), find_named(table, _QUATERNION), None
-    columns, names = ([], ["x_mm", "y_mm", "z_mm"]) if position is None else (position[0], [])
-    values = poses[:, :3, 3] / LENGTH_UNITS["mm" if position is None else commanded.length_unit]
+    quaternion, vector = find_named(table, _QUATERNION), None
+    columns, names = list(commanded.position), [] if commanded.position else ["x_mm", "y_mm", "z_mm"]
+    values = poses[:, :3, 3] / LENGTH_UNITS[commanded.length_unit]
     turns = Rotation.from_matrix(poses[:, :3, :3])
     if quaternion is not None:
         columns, values = [*columns, *quaternion[0]], np.hstack([values, turns.as_quat(scalar_first=True)])

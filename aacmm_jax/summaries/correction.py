@@ -25,13 +25,15 @@ def correction_summary(
     *,
     unit: str,
     of_readings: bool,
+    targets: Float[np.ndarray, "N 4 4"] | None = None,
     recorded: Float[np.ndarray, "M m"] | None = None,
 ) -> dict[str, Any]:
     """Plain values for JSON and display; rows are counted from 1.
 
     ``q``: commanded readings, or those that the search for a pose began with, rad and mm; perhaps with temperatures.
-    ``unit``: of readings in the tables. ``of_readings``: whether readings were commanded; of positions with
-    orientations nothing is known of the arm without a correction. ``recorded``: the readings of the calibration.
+    ``unit``: of readings in the tables. ``of_readings``: whether readings were commanded; of positions
+    without readings nothing is known of the arm without a correction. ``targets``: poses wanted, mm, of a table with
+    readings; by default those of the nominal arm at the readings. ``recorded``: the readings of the calibration.
     """
     reached, after = np.asarray(corrected.reached), np.asarray(corrected.q)
     n, kinds = nominal.joints, nominal.geometry.kinds
@@ -86,11 +88,10 @@ def correction_summary(
         )
     summary["largest_distance_mm"] = float(distance[reached].max())
     summary["largest_angle_deg"] = float(angle[reached].max() / DEG)
-    if not of_readings:
+    if not of_readings and targets is None:
         return summary
-    before = np.asarray(calibrated.position(q[reached])) - np.asarray(
-        nominal.position(q[reached, : nominal.beside.own])
-    )
+    targets = np.asarray(nominal.pose(q[:, : nominal.beside.own])) if targets is None else targets
+    before = np.asarray(calibrated.position(q[reached])) - targets[reached, :3, 3]
     summary["largest_distance_before_mm"] = float(np.linalg.norm(before, axis=1).max())
     moved = np.where(reached[:, None], np.abs(after - commanded), 0.0)
     change, slide = (moved * np.array(by_joint(nominal, *units)) for units in ((1 / DEG, 0.0), (0.0, 1.0)))
@@ -101,7 +102,7 @@ def correction_summary(
             amount = {f"change_{in_unit}": float(values[row, joint])}
             summary[f"largest_{key}"] = {"row": row + 1, "joint": joint + 1} | amount
     large = np.flatnonzero(change.max(axis=1) > _LARGE_CHANGE) + 1
-    if len(large):
+    if len(large) and of_readings:
         warnings.append(
             f"In {pluralise(len(large), 'row')} (row {shorten([str(x) for x in large])}) the correction changes a "
             f"reading by more than {_LARGE_CHANGE:g} deg: axes of the arm nearly align in these poses, so small "
@@ -124,6 +125,7 @@ def corrections(summary: dict[str, Any]) -> View:
     """How far poses are reached with corrected readings, and how much readings change."""
     rows, missed = summary["rows"], summary["not_reached"]
     yield f"{rows - len(missed)} of {pluralise(rows, 'pose')} are reached with corrected readings."
+    yield summary["targets"]
     yield from warnings_of(summary)
     meant, has = (", ".join(f"{x:.3f}" for x in probe) for probe in summary["probe_mm"])
     if meant == has:

@@ -238,16 +238,25 @@ def robot_base_rows(record: CalibrationRecord) -> list[dict[str, Any]]:
 
 def _base_rows(record: CalibrationRecord) -> list[dict[str, Any]]:
     """The base frame as seen from each frame with known coordinates (an artefact's, a station's), k = 1."""
-    rows = {}
+    rows = []
+    for part in dict.fromkeys(frames_in_base(record).values()):
+        base, by = inverse_frame(np.asarray(record.observed.geometry[part]))
+        u = plain(np.sqrt(np.diag(by @ record.observed.geometry_covariance[part] @ by.T)))
+        position = {"in": part, "position_mm": base[3:].tolist(), "position_u_mm": u[3:]}
+        rows.append(position | {"rotation_rad": base[:3].tolist(), "rotation_u_rad": u[:3]})
+    return rows
+
+
+def frames_in_base(record: CalibrationRecord) -> dict[str, str]:
+    """The frames of stations, boards and placements in the base frame, as parts of the geometry, by the names of the
+    observations in them."""
+    frames = {}
     for observation in record.recording.capture.observations:
         part = getattr(observation, "frame", None)
         # A placement on a platform is not in the base.
         if part is not None and getattr(observation, "index", None) is None:
-            base, by = inverse_frame(np.asarray(record.observed.geometry[part]))
-            u = plain(np.sqrt(np.diag(by @ record.observed.geometry_covariance[part] @ by.T)))
-            position = {"in": part, "position_mm": base[3:].tolist(), "position_u_mm": u[3:]}
-            rows[part] = position | {"rotation_rad": base[:3].tolist(), "rotation_u_rad": u[:3]}
-    return list(rows.values())
+            frames[observation.name] = part
+    return frames
 
 
 def less_weight(residuals: tuple[ObservationResiduals, ...]) -> list[dict[str, Any]]:

@@ -288,7 +288,9 @@ def geometry_table(parts: Rows, coverage: float) -> Table:
             errors = [abs(value - stated) for _, (value, stated) in zip(quantity["values"], pairs, strict=False)]
             rows.append(quantity | {"part": part["part"], "difference": max(errors, default="")})
     certified = any(part["certified"] is not None for part in parts)
-    return listed("Geometry found", rows, {
+    framed = any(part["units"] == ["rad"] * 3 + ["mm"] * 3 for part in parts)
+    caption = "Geometry found" + (" (a frame takes its points x to R x + origin)" if framed else "")
+    return listed(caption, rows, {
         "part": "part",
         "quantity": "quantity",
         "value": lambda row: tables.quantity_words(row, u=False, coverage=coverage),

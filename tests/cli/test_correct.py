@@ -2,6 +2,8 @@
 
 import csv
 import json
+import math
+import runpy
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -178,11 +180,74 @@ def test_columns_of_other_names_and_positions_in_metres(arms):
     np.testing.assert_allclose(found, np.array(corrected[:2], dtype=float), atol=1e-6)
 
 
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    """A folder with a calibration of the simulated robot by its tracker, and its record."""
+    folder = tmp_path_factory.mktemp("robot")
+    command_line(folder, "calibrate", ROBOT, "-o", "robot.h5", "--model", "dh", "--no-automatic")
+    return folder, aj.files.load_calibration(folder / "robot.h5")
+
+
 @pytest.mark.slow
-def test_positions_are_of_the_tip_or_of_a_target_by_its_name(tmp_path):
+def test_positions_in_the_frame_of_the_tracker_are_reached(robot):
+    """By the robot as built, whose tracker and target are known; joint readings alone leave the tracker's frame."""
+    folder, record = robot
+    made = runpy.run_path(str(ROBOT.with_name("make.py")))
+    true, station = made["_robot"](made["TARGET"]), np.array(made["STATION"])
+    turn = Rotation.from_rotvec(station[:3])
+    q = DEG * np.array([10, 30, 70, 10, 60, 0]) + 0.1 * np.arange(6)[:, None]
+    wanted = turn.inv().apply(np.asarray(true.position(q)) - station[3:]) + np.array([2.0, -1, 1])
+    header = [*(f"joint_{i}" for i in range(1, 7)), "x_t", "y_t", "z_t", "x_dif"]
+    write(folder / "targets.csv", header, np.hstack([q / DEG, wanted, np.zeros((6, 1))]))
+    command = ("correct", "robot.h5", "targets.csv", "-o", "out.csv", "--overwrite", "--unit", "deg")
+    in_frame = ("--in-frame", "tracker", "--positions", "x_t,y_t,z_t", "--probe", "ball", "--json")
+    found = json.loads(command_line(folder, *command, *in_frame).stdout)
+    assert "columns x_t, y_t, z_t) in the frame of tracker" in found["targets"]
+    assert found["largest_distance_before_mm"] == pytest.approx(math.sqrt(6), abs=0.3)
+    corrected = DEG * np.array([[float(row[name]) for name in header[:6]] for row in table(folder / "out.csv")])
+    seen = turn.inv().apply(np.asarray(true.position(corrected)) - station[3:])
+    assert np.linalg.norm(seen - wanted, axis=1).max() < 0.15
+    turned = np.asarray(record.calibrated.arm.pose(corrected))[:, :3, :3]
+    np.testing.assert_allclose(turned, record.recording.nominal.arm.pose(q)[:, :3, :3], rtol=0, atol=1e-8)
+    # The controller computes readings with the nominal arm from poses in its own base frame.
+    commanded = json.loads(command_line(folder, *command, *in_frame, "--write", "poses").stdout)
+    assert "in the base frame" in " ".join(commanded["warnings"])
+    poses = np.array([[float(row[name]) for name in header[6:9]] for row in table(folder / "out.csv")])
+    assert np.linalg.norm(poses - np.asarray(true.position(q)), axis=1).max() < 10
+    readings = json.loads(command_line(folder, *command, "--json").stdout)
+    assert "give --in-frame tracker" in readings["targets"]
+    for wrong, said in ((in_frame[:2], "--positions"), (("--in-frame", "x", *in_frame[2:]), "(tracker)")):
+        assert said in " ".join(command_line(folder, *command, *wrong, expect=2).stderr.split())
+
+
+@pytest.mark.slow
+def test_the_frame_of_an_instrument_takes_its_points_to_the_base(robot):
+    """As the documentation of --json says: R x + origin."""
+    folder, record = robot
+    (observation,) = record.recording.capture.observations
+    parts = {row["part"]: np.array(row["values"]) for row in json.loads(
+        command_line(folder, "show", "robot.h5", "--json").stdout
+    )["geometry"]}  # fmt: skip
+    frame, arm = parts["frame of tracker"], record.calibrated.arm.replace(probe=parts["offset of ball"])
+    placed = Rotation.from_rotvec(frame[:3]).apply(observation.points) + frame[3:]
+    assert np.linalg.norm(placed - arm.position(observation.q), axis=1).max() < 0.2
+
+
+def test_positions_are_reached_from_the_readings_beside_them(arms):
+    folder, _, calibrated = arms
+    points = np.asarray(calibrated.position(Q[:2])) + 5.0
+    header = [*(f"q_{i}_rad" for i in range(1, 7)), "x", "y", "z"]
+    write(folder / "both.csv", header, np.hstack([Q[:2], points]))
+    found = json.loads(run(arms, "both.csv", "-o", "out.csv", "--json").stdout)
+    q = np.array([[float(row[name]) for name in header[:6]] for row in table(folder / "out.csv")])
+    np.testing.assert_allclose(calibrated.position(q), points, rtol=0, atol=1e-6)
+    assert found["largest_distance_before_mm"] == pytest.approx(5 * math.sqrt(3))
+
+
+@pytest.mark.slow
+def test_positions_are_of_the_tip_or_of_a_target_by_its_name(robot):
     """The offset of the target was found by the calibration, and is not the tip of the arm."""
-    command_line(tmp_path, "calibrate", ROBOT, "-o", "robot.h5", "--model", "dh", "--no-automatic")
-    record = aj.files.load_calibration(tmp_path / "robot.h5")
+    tmp_path, record = robot
     (target,) = (np.asarray(at) for name, at in record.observed.geometry.items() if name == "offset of ball")
     nominal, calibrated = record.recording.nominal.arm, record.calibrated.arm
     q = DEG * np.array([10, 30, 70, 10, 60, 0]) + 0.02 * np.arange(3)[:, None]
@@ -246,15 +311,18 @@ def test_poses_of_a_urdf_are_in_its_base_link():
         ([], [0] * 6, (), "--unit"),
         ([], [0] * 5, ("--unit", "deg"), "q_1 to q_6"),
         ([f"q_{i}_deg" for i in range(1, 7)], [0] * 6, ("--unit", "rad"), "states deg"),
-        ([f"q_{i}_deg" for i in range(1, 7)], [0] * 6, ("--near", "0,0,0,0,0,0"), "or --near"),
+        ([f"q_{i}_deg" for i in range(1, 7)], [0] * 6, ("--near", "0,0,0,0,0,0"), "the first is 'q_1_deg'"),
         (["x", "y", "z", "qw", "qx", "qy", "qz"], [1, 2, 3, 1, 0, 0, 0], ("--unit", "deg"), "--near"),
-        (["x", "y", "z"], [1, 2, 3], ("--unit", "deg"), "give either columns q_1 to q_6 or --near"),
+        (["x", "y", "z"], [1, 2, 3], ("--unit", "deg"), "or give --near"),
         (
             ["x", "y", "z", "qw", "qx", "qy", "qz"],
             [1, 2, 3, 1, 0, 0, 1],
             ("--unit", "deg", "--near", "0,0,0,0,0,0"),
             "row 1",
         ),
+        ([f"q_{i}_deg" for i in range(1, 7)], [0] * 6, ("--in-frame", "A"), "no columns x, y and z"),
+        ([f"q_{i}_deg" for i in range(1, 7)] + ["x", "y", "z"], [0] * 9, ("--in-frame", "A"), "of its frames (none)"),
+        ([f"q_{i}_deg" for i in range(1, 7)], [0] * 6, ("--positions", "1,2"), "three, x, y and z"),
         (["qw", "qx", "qy", "qz"], [1, 0, 0, 0], ("--unit", "deg", "--near", "0,0,0,0,0,0"), "x, y and z"),
         ([], [0] * 6, ("--unit", "deg", "--probe", "1,2"), "--probe"),
     ],

@@ -1,4 +1,4 @@
-"""For controllers and other programs: ``export`` writes a calibration, ``correct`` corrects commanded poses."""
+"""``export``: writes a calibration for controllers and other programs."""
 
 import json
 import math
@@ -8,18 +8,17 @@ from typing import Any, Literal
 import numpy as np
 import typer
 
-from .. import files, kinematics, summaries
+from .. import files, summaries
 from ..core.errors import InputError
 from ..core.text import printable, shorten
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import check_kept, together, write_text
 from . import options
-from .app import command, show_summary, warn_of_unusable
+from .app import command, warn_of_unusable
 from .arm_command import first_frame
 from .certificate_command import dcc_of
-from .chains import named_chain, one_chain_of
-from .commanded import at_temperature, in_first_frame, other_tip, tool_tip
-from .options import argument, flag, names_option, numbers_option, option, output
+from .chains import one_chain_of
+from .options import flag, names_option, option, output
 
 _ROBOTS = ("urdf", "mjcf")
 _FORMATS = {".urdf": "urdf", ".xml": "mjcf", ".json": "json", ".csv": "csv", ".py": "python"}
@@ -188,7 +187,8 @@ def _text(record: Any, specification: Any, form: str, calibrated: bool) -> str:
 
         return specification_toml(specification, source=source)
     title = ", ".join(part for part in (specification.name, source) if part)
-    return files.python_program(specification.arm, title=title, base=first_frame(nominal))
+    written = record.recording.recorded_as
+    return files.python_program(specification.arm, title=title, base=first_frame(nominal), recorded_as=written)
 
 
 def _zero_offsets(record: Any) -> Any:
@@ -314,140 +314,3 @@ def _urdf(record: Any, specification: Any, form: str) -> tuple[str, list[str]]:
         "Left unchanged as far as possible, because measurements of the tip do not determine them: the base, and the "
         "position of each frame along its joint axis and its angle about this axis.",
     ]
-
-
-@command(
-    "aacmm correct calibration.h5 poses.csv -o corrected.csv --unit deg",
-    "aacmm correct robot.h5 left.csv -o corrected.csv --unit deg --chain left",
-    "aacmm correct calibration.h5 points.csv -o commanded.csv --unit deg --near 0,-90,90,0,90,0 --write poses",
-    "aacmm correct calibration.h5 poses.csv -o corrected.csv --unit deg --near 0,-90,90,0,90,0 --probe 0,0,150",
-    "aacmm correct robot.h5 points.csv -o corrected.csv --unit deg --near 0,-90,90,0,90,0 --probe reflector",
-)
-def correct(
-    calibration: Path = options.CALIBRATION_FILE,
-    poses: Path = argument(
-        "Table with one row per commanded pose. The columns are either joint readings (q_1, q_2, ..., or any names if "
-        "there are no other columns), or positions x, y, z (mm) with qw, qx, qy, qz (quaternion) or rx, ry, rz "
-        "(rotation vector).",
-        "POSES.csv",
-    ),
-    output: Path = output("File to write the table of corrected readings to (CSV).", "FILE.csv"),
-    unit: Literal["deg", "rad"] | None = option(
-        "Unit of joint readings and rotation vectors if the header does not state it (as q_1_deg does). Readings of "
-        "prismatic joints are in mm."
-    ),
-    columns: str | None = option(
-        "Columns of the joint readings if they are not named q_1, q_2, ...: names, a pattern, or column numbers from "
-        "1, separated by commas. Default: all columns, if the table has exactly one column per joint.",
-        "NAMES",
-    ),
-    length_unit: Literal["mm", "m", "um", "inch"] | None = option(
-        "Unit of positions if the column header does not state it (as x_m does). Default: mm."
-    ),
-    near: str | None = option(
-        "For a table of positions: readings from which the search for the joint readings starts, in the configuration "
-        "(elbow, wrist) in which the arm is to be; positions without orientations keep the orientation of these "
-        "readings. Default: the columns q_1, q_2, ... of the table.",
-        "Q1,Q2,...",
-    ),
-    probe: str | None = option(
-        "Tip of the tool in the last frame (mm), the same for the nominal and the calibrated arm; or the name of a "
-        "target whose position the calibration found. Default: the tip of each arm, not a target; if the calibration "
-        "changed the tip, this change is corrected too.",
-        "X,Y,Z or TARGET",
-    ),
-    temperature: float | None = option(
-        "Temperature (C) of the arm, if the arm was calibrated with thermal expansion. Default: the column "
-        "temperature_C of the table.",
-        "C",
-    ),
-    chain: str | None = option(
-        "Chain of a robot that the table is of; its columns are the joints of this chain.", "NAME"
-    ),
-    write: Literal["readings", "poses"] = option(
-        "What to write: corrected joint readings, or, for a controller that takes poses only, the corrected poses to "
-        "command, in the units and columns of the table.",
-        default="readings",
-    ),
-    as_json: bool = options.JSON,
-) -> None:
-    """Correct commanded poses, as joint readings or poses.
-
-    A controller that uses the nominal parameters expects the tip in the pose that the nominal arm has at the commanded
-    joint readings. The corrected readings bring the tip of the calibrated arm to this pose. The nominal and the
-    calibrated arm have the same base frame; positions and orientations in POSES.csv are in this frame too (for a URDF:
-    in its base link). With seven or more joints, the readings change as little as possible; with fewer than six
-    joints, only the position is corrected. Rotations of the tool that the calibration data do not determine stay
-    nominal.
-
-    The readings are those of the nominal arm. The signs and offsets that a manifest gives for the recorded angles of a
-    capture are not applied.
-
-    The output table has the columns and the unit of the input table. If the pose of a row cannot be reached within the
-    joint limits of the nominal arm, its readings are left empty and the exit code is 1. Do not send an arm to such a
-    pose.
-
-    A table of positions without orientations needs --near; the tool keeps the orientation that the nominal arm has at
-    these readings. Corrected poses (--write poses) hold for a controller that computes joint readings with the nominal
-    parameters and in the configuration (elbow, wrist) of the readings given.
-    """
-    from ..core.numpy_or_jax import to_numpy
-    from ..files.table_columns import corrected_csv, corrected_poses_csv, read_poses
-
-    begin = None if near is None else numbers_option("--near", near, "Q1,Q2,... with one reading per joint")
-    picked = None if columns is None else [int(x) if x.isdecimal() else x for x in names_option(columns)]
-    with together(output):
-        record = files.load_calibration(InputFile(calibration))
-        nominal, calibrated = to_numpy((record.recording.nominal.arm, record.calibrated.arm))
-        own = named_chain(nominal, chain)
-        if probe is not None:
-            tool = tool_tip(record, own, probe)
-            nominal, calibrated = nominal.replace(probe=tool), calibrated.replace(probe=tool)
-        commanded = read_poses(
-            InputFile(poses),
-            nominal if own is None else own.arm,
-            unit=unit,
-            near=begin,
-            columns=picked,
-            length_unit=length_unit,
-        )
-        given = commanded if own is None else commanded._replace(q=own.readings(commanded.q))
-        q = at_temperature(given, calibrated, temperature)
-        meant = np.array(nominal.pose(q[:, : nominal.beside.own]))
-        oriented = commanded.oriented or commanded.poses is None
-        targets = meant if commanded.poses is None else in_first_frame(record, commanded.poses)
-        targets[:, :3, :3] = targets[:, :3, :3] if oriented else meant[:, :3, :3]
-        if write == "poses":
-            to_command, corrected = kinematics.corrected_targets(nominal, calibrated, q, targets, oriented=oriented)
-            base = first_frame(record.recording.nominal)
-            in_file = to_command if base is None else base @ to_command
-            text = corrected_poses_csv(commanded, in_file, np.asarray(corrected.reached))
-        else:
-            corrected = kinematics.readings_at_poses(calibrated, q, targets, nominal.limits)
-            found = np.asarray(corrected.q)
-            found = found if own is None else own.of_robot(found)
-            text = corrected_csv(commanded, found, np.asarray(corrected.reached))
-        summary = summaries.correction.correction_summary(
-            nominal,
-            calibrated,
-            q,
-            corrected,
-            unit=commanded.unit,
-            of_readings=commanded.poses is None,
-            recorded=np.asarray(record.recording.capture.readings),
-        )
-        tip = slice(None) if own is None else slice(3 * own.number, 3 * own.number + 3)
-        summary["probe_mm"] = [np.asarray(arm.probe)[tip].tolist() for arm in (nominal, calibrated)]
-        if probe is None and (commanded.poses is not None or summary["position_only"]):
-            summary["warnings"] += other_tip(record, own, np.asarray(nominal.probe)[tip])
-        if commanded.temperature is not None and q.shape[1] == calibrated.beside.own:
-            summary["warnings"].append(
-                "The arm was calibrated without thermal expansion, so the column temperature_C has no effect; "
-                "calibrate with --model expansion to correct for temperature."
-            )
-        write_text(output, text)
-        summary["written"] = str(output)
-    warn_of_unusable(calibration, record)
-    show_summary(summary, as_json, summaries.correction.corrections)
-    if summary["not_reached"]:
-        raise typer.Exit(1)
