@@ -187,7 +187,8 @@ def _text(record: Any, specification: Any, form: str, calibrated: bool) -> str:
 
         return specification_toml(specification, source=source)
     title = ", ".join(part for part in (specification.name, source) if part)
-    return files.python_program(specification.arm, title=title, base=first_frame(nominal))
+    written = record.recording.recorded_as
+    return files.python_program(specification.arm, title=title, base=first_frame(nominal), recorded_as=written)
 
 
 def _zero_offsets(record: Any) -> Any:

@@ -17,7 +17,7 @@ from .options import argument, option, output
 
 @command(
     "aacmm verify poses.toml --delivered kinematics.yaml",
-    "aacmm verify poses.toml --delivered panda -o verified.html",
+    "aacmm verify poses.toml --delivered panda --max-rms-mm 1 -o verified.html",
     "aacmm verify capture.h5 --delivered robot-as-delivered.urdf --tip tool0",
 )
 def verify(
@@ -34,6 +34,11 @@ def verify(
     ),
     base: str | None = options.BASE_LINK,
     tip: list[str] | None = options.TIP_LINK,
+    max_rms_mm: float | None = option(
+        "RMS error of the tip that your task allows: say whether the delivered parameters meet it, and exit with "
+        "code 1 unless they do.",
+        min=0,
+    ),
     output: Path | None = output(
         "Page for printing: verdict, picture, numbers, and what was not tested.", "PAGE.html", default=None
     ),
@@ -50,7 +55,7 @@ def verify(
     The verdict is a two-sided test at the 5 % level, and "no difference that matters" (errors over the working volume
     that differ by less than 30 % of the larger) two one-sided tests. If the data do not match
     the arm (as aacmm calibrate tests it), there is no verdict. The exit code is 1 then, and if the delivered parameters
-    are worse, or not good.
+    are worse, or not good; with --max-rms-mm, unless they meet it.
     """
     from ..pipeline.verification import verify as run
 
@@ -64,6 +69,7 @@ def verify(
         recording.nominal.name,
         delivered or ("" if given is None else given.name),
         scaled=bool(measured.lengths or measured.observations),
+        max_rms=max_rms_mm,
     )
     if output is not None:
         from ..report import write_verification
@@ -73,7 +79,7 @@ def verify(
         write_verification(output, checked, measured, summary, sources=list(sources))
         summary["written"] = str(output)
     show_summary(summary, as_json, summaries.verification.verification)
-    if checked.mismatch or checked.verdict in ("worse", "not good"):
+    if not summary["achieved"]:
         raise typer.Exit(1)
 
 

@@ -5,5 +5,6 @@ from .capture import stack_captures as stack_captures
 from .capture_data import ReferenceLength as ReferenceLength
 from .noise import Noise as Noise
 from .recording import ProbedSphere as ProbedSphere
+from .recording import RecordedAs as RecordedAs
 from .recording import Recording as Recording
 from .simulation import simulate as simulate

@@ -90,6 +90,36 @@ class ReadingSet(NamedTuple):
     lines: tuple[str, ...] = ()
 
 
+class RecordedAs(NamedTuple):
+    """How the readings of a recording are written: joint values are factors x readings + constants.
+
+    Args:
+        names: Column of each joint.
+        unit: Of the readings, as the manifest states it.
+        factors: With units, signs and coupled joints, rad per unit, or mm of a prismatic joint.
+        constants: Of the offsets, rad or mm.
+
+    Example:
+        >>> deg = np.radians(1.0)
+        >>> written = aj.data.RecordedAs(("a", "b"), "deg", np.diag([deg, -deg]), np.array([0.0, 90 * deg]))
+        >>> print(written.joint_values(np.array([[10.0, 30.0]])) / deg, written.readings(np.array([[0.0, 0.0]])))
+        [[10. 60.]] [[ 0. 90.]]
+    """
+
+    names: tuple[str, ...]
+    unit: str
+    factors: Float[np.ndarray, "n n"]
+    constants: Float[np.ndarray, " n"]
+
+    def joint_values(self, readings: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
+        """Joint values, rad and mm, of readings as recorded."""
+        return readings @ self.factors.T + self.constants
+
+    def readings(self, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
+        """Readings as recorded of joint values, rad and mm."""
+        return np.linalg.solve(self.factors, (q - self.constants).T).T
+
+
 class Recording(NamedTuple):
     """A capture with the nominal arm that recorded it and, for a simulation, the true one.
 
@@ -110,6 +140,7 @@ class Recording(NamedTuple):
             "offset" and "unit" of the joint readings, "units" of measured points.
         read_as: Which of the recorded readings is that of each joint, from 1, negative where it counts the other way;
             None where the signs are not known or those recorded.
+        recorded_as: How the readings are written in the tables it was read from; None where that is not known.
         images: What was found in each image of a target.
         notes: What was read of files that hold more than a table, such as the poses in which an arm stood still; files
             of captures do not keep them.
@@ -135,6 +166,7 @@ class Recording(NamedTuple):
     as_found: ArmSpecification | None = None
     stated: tuple[str, ...] = ()
     read_as: tuple[int, ...] | None = None
+    recorded_as: RecordedAs | None = None
     images: tuple[ReadImage, ...] = ()
     notes: tuple[str, ...] = ()
     other_readings: ReadingSet | None = None

@@ -15,7 +15,7 @@ from ..data.noise import ArmNoise
 from ..data.observations.declared import Entry
 from ..data.observations.observation import AbstractObservation
 from ..data.observations.simulated import kinds
-from ..data.recording import ProbedSphere, ReadImage, Recording, checked_sphere
+from ..data.recording import ProbedSphere, ReadImage, RecordedAs, Recording, checked_sphere
 from ..kinematics.arm import Arm, correction_names, reading_as, readings_unit
 from ..kinematics.beside import BY_JOINT, CHAIN, COLUMNS
 from ..kinematics.corrected_arm import loads_of
@@ -25,7 +25,7 @@ from ..kinematics.robots import chain_facts
 from .arm_tables import GEOMETRY, with_coefficients
 from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, undamaged, write_tables
 from .records import Field, attribute_name, record_in, row_values, rows_in, rows_table, table_of, values_in
-from .schema import ARM, IMAGES, LENGTHS, RECORDING, SPHERES, USUAL_NOISE
+from .schema import ARM, IMAGES, LENGTHS, RECORDED_AS, RECORDING, SPHERES, USUAL_NOISE
 from .stored_checks import read_checked
 from .urdf import located
 
@@ -119,6 +119,8 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
         tables["images"] = rows_table("image", recording.images, IMAGES)
     if recording.usual is not None:
         tables["usual_noise"] = table_of(recording.usual, USUAL_NOISE)
+    if recording.recorded_as is not None:
+        tables["recorded_as"] = table_of(recording.recorded_as, RECORDED_AS)
     for number, observation in enumerate(capture.observations, start=1):
         stored = observation.stored()
         q = stored.pop("q", None)
@@ -172,6 +174,7 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
         spheres=spheres,
         usual=record_in(ArmNoise, USUAL_NOISE, stored.tables.get("usual_noise")),
         as_found=as_found,
+        recorded_as=record_in(RecordedAs, RECORDED_AS, stored.tables.get("recorded_as")),
         images=rows_in(ReadImage, IMAGES, "image", stored.tables.get("images")),
         **values_in(Recording, RECORDING, stored.tables, stored.attributes),
     )

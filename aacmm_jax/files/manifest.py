@@ -180,6 +180,7 @@ def _read(
             as_found=as_found,
             stated=_stated(model),
             read_as=None if model.angles is None else model.angles.read_as(nominal.arm.joints),
+            recorded_as=readings.recorded_as,
             images=tuple(images),
             notes=tuple(source.notes),
         )

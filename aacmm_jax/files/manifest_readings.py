@@ -12,6 +12,7 @@ from ..core.errors import InputError, nearest
 from ..core.text import listed, quoted
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import check_revolutions
+from ..data.recording import RecordedAs
 from ..kinematics.arm import Arm, by_joint
 from ..kinematics.beside import BY_JOINT, COLUMNS
 from ..kinematics.robots import ChainOf, chain_of
@@ -120,6 +121,17 @@ class Readings:
             q = chain.readings(q, self._link(wanted))
             recorded |= {name: chain.spread(recorded[name]) for name in BY_JOINT if name in recorded}
         return np.hstack([q, *recorded.values()])
+
+    @property
+    def recorded_as(self) -> RecordedAs | None:
+        """How the readings of the first table are written; None of a robot of several chains."""
+        angles, n = self.angles, self._arm.joints
+        if angles is None or self._arm.chains:
+            return None
+        constants = angles.converted(np.zeros((1, n)), self._arm)
+        factors = (angles.converted(np.eye(n), self._arm) - constants).T
+        names = [self.header[i - 1] if i <= len(self.header) else f"column {i}" for i in self.columns]
+        return RecordedAs(tuple(names), angles.lerobot_unit or angles.unit, factors, constants[0])
 
     def _chain(self, stated: str | None) -> ChainOf | None:
         """The chain of a robot that the manifest states for a table; None for an arm."""

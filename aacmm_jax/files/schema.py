@@ -21,6 +21,13 @@ RECORDING: Fields = {
     "read_as": count("recorded reading of each joint, from 1, negative where it counts the other way", least=None),
 }
 
+RECORDED_AS: Fields = {
+    "names": text("column of the joint's readings", "joint"),
+    "unit": text("unit of the readings"),
+    "factors": number("joint value per reading", "rad or mm per unit", "joint", "reading"),
+    "constants": number("joint value at readings of 0", "rad, or mm of a prismatic joint", "joint"),
+}
+
 NOISE: Fields = {
     "encoder_arcsec": Field("standard deviation of a reading, arcsec", name="encoder_arcsec", least=0),
     "linear_encoder": number("standard deviation of the reading of a prismatic joint", "mm", least=0),
@@ -316,6 +323,7 @@ POINTS: Fields = {
 # By the name of the table.
 TABLES: dict[str, Fields] = {
     "usual_noise": USUAL_NOISE,
+    "recorded_as": RECORDED_AS,
     "reference": LENGTHS,
     "sphere": SPHERES,
     "images": IMAGES,

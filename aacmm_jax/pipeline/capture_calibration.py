@@ -304,4 +304,5 @@ def join_recordings(recordings: Mapping[str, Recording], *, same_probe: bool = F
         sources=sources,
         stated=stated,
         read_as=first.read_as if same else None,
+        recorded_as=None,
     )

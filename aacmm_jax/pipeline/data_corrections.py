@@ -113,7 +113,7 @@ def with_corrected_readings(
     nominal = recording.nominal._replace(arm=_with_zeros(recording.nominal.arm, best))
     as_recorded = recording.read_as or range(1, len(best.order) + 1)
     read_as = tuple(sign * as_recorded[column] for sign, column in zip(best.signs, best.order, strict=True))
-    corrected = recording._replace(capture=capture, nominal=nominal, read_as=read_as)
+    corrected = recording._replace(capture=capture, nominal=nominal, read_as=read_as, recorded_as=None)
     try:
         again = recorded(solve(corrected), corrected)
     except InputError:

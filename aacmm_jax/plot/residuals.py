@@ -99,11 +99,13 @@ def pose_chart(
     unit: str = "mm",
     far: Marked = ("", ()),
     most: int | None = None,
+    limit: float | None = None,
 ) -> Chart:
     """The residual of every pose on a logarithmic axis: of two arms, or of one arm by the kind of its observation.
 
     ``arms`` has the residuals of all poses by the name of the arm, NaN where there is none; ``unit`` is "mm", "deg" or
-    "standard deviations", whose expectation of 1 is drawn; ``far`` marks poses; ``most`` poses are drawn besides those.
+    "standard deviations", whose expectation of 1 is drawn, as a ``limit`` is; ``far`` marks poses; ``most`` poses are
+    drawn besides those.
     """
     last_arm, last = list(arms.items())[-1]
     finite, marked = np.flatnonzero(np.isfinite(last)), np.asarray(far[1], dtype=int)
@@ -127,6 +129,8 @@ def pose_chart(
         marks.append(Marks(far[0], marked + 1, np.maximum(last[marked], _LEAST), "ring", "accent", size=11))
     if unit == "standard deviations":
         marks.append(level(1.0))
+    if limit:
+        marks.append(level(limit))
     ticks, edges = groups.parts()
     x = linear("pose" if len(groups.sizes) == 1 else f"pose, {groups.word} after {groups.word}",
                [0.0, len(last) + 1.0], margin=0.0)  # fmt: skip
@@ -141,6 +145,7 @@ def pose_chart(
     median, largest = (format_number(float(value)) for value in (np.median(last[finite]), last[finite].max()))
     description = f"Median {median} {unit}, largest {largest} {unit} ({last_arm} arm)."
     description += " Poses that are the only pose of their socket are not drawn." if len(finite) < len(last) else ""
+    description += f" The line is at {limit:g} {unit}." if limit else ""
     description += f" {len(drawn)} of {len(finite)} poses are drawn." if len(drawn) < len(finite) else ""
     return Chart(id, title, description, (plot,), None if len(arms) > 1 else _pose_table(groups, last, unit, far))
 
@@ -169,10 +174,14 @@ def distances_in(capture: Capture, evaluation: Evaluation) -> np.ndarray:
     return np.where(single, np.nan, distances)
 
 
-def arms_chart(capture: Capture, arms: Mapping[str, np.ndarray], most: int | None = None) -> Chart:
-    """Distances of all poses by the nominal and by the calibrated arm."""
+def arms_chart(
+    capture: Capture, arms: Mapping[str, np.ndarray], most: int | None = None, limit: float | None = None
+) -> Chart:
+    """Distances of all poses by the nominal and by the calibrated arm, mm; with a line at a limit."""
     groups = Groups.of(capture)
-    return pose_chart("stages", f"Distance of every pose from its {groups.centre}", groups, arms, most=most)
+    return pose_chart(
+        "stages", f"Distance of every pose from its {groups.centre}", groups, arms, most=most, limit=limit
+    )
 
 
 def distances_by_arm(record: CalibrationRecord) -> dict[str, np.ndarray]:

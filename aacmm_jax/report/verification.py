@@ -5,9 +5,15 @@ from typing import Any
 from ..data.capture import Capture
 from ..pipeline.verification import Verification
 from ..plot.residuals import arms_chart
-from ..summaries.verification import VERDICT_MARKS, accuracy_table, counted, meaning
+from ..summaries.verification import accuracy_table, counted, mark_of, meaning
 from ..uncertainty.coverage import LEVEL_IN_PERCENT
 from .elements import DRAWN, Report, Section
+
+
+def _with_what_to_do(summary: dict[str, Any]) -> str:
+    """The verdict with what to do in its headline."""
+    headline, found, rest = summary["says"].partition(": ")
+    return f"{headline} ({summary['do']}){found}{rest}"
 
 
 def verification_report(checked: Verification, capture: Capture, summary: dict[str, Any]) -> Report:
@@ -16,7 +22,7 @@ def verification_report(checked: Verification, capture: Capture, summary: dict[s
     shown = {name: distances for name, distances in zip(arms, checked.distances, strict=True)}
     if checked.same:
         del arms["nominal"], shown["nominal"]
-    picture = arms_chart(capture, shown, DRAWN)
+    picture = arms_chart(capture, shown, DRAWN, summary["max_rms_mm"])
     errors = [
         (
             f"RMS error, {name}",
@@ -32,8 +38,8 @@ def verification_report(checked: Verification, capture: Capture, summary: dict[s
     return Report(
         title=f"Verification of delivered parameters, {summary['arm'] or 'an arm'}",
         subtitle=f"{counted(summary)} Delivered: {summary['delivered']}",
-        verdict=summary["says"],
-        verdict_mark=VERDICT_MARKS.get(summary["verdict"], "unsure"),
+        verdict=_with_what_to_do(summary),
+        verdict_mark=mark_of(summary),
         warnings=summary["warnings"],
         numbers=[
             *errors,

@@ -21,7 +21,7 @@ from ..diagnostics.pose_residuals import rms
 from ..pipeline.cross_validation import groups_of
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .calibration import agreement_row, length_metrics, metrics, metrics_by_socket_and_length
-from .maxima import judged_maxima
+from .maxima import failed_before, judged_maxima
 from .result_tables import BEFORE
 from .tables import attributes, plain, rows_of
 from .verdicts import evaluation_verdict
@@ -75,6 +75,7 @@ def evaluation_summary(
     decisions = judged_maxima(summary, record)
     for key, decision in (("kept", "conforms"), ("failed", "fails"), ("undecided", "undecided")):
         summary[key] = [judged.says for judged in decisions if judged.decision == decision]
+    summary["failed_before"] = {stage: failed_before(summary, record.maxima, stage) for stage in BEFORE}
     tests = record.acceptance() if tests is None else tests
     summary |= _judged(record, tests)
     return summary | {"verdict": evaluation_verdict(summary, len(summary["warnings"]))._asdict()}

@@ -59,6 +59,19 @@ def judged_maxima(summary: Mapping[str, Any], record: EvaluationRecord) -> list[
     return decisions
 
 
+def failed_before(summary: Mapping[str, Any], maxima: Mapping[str, float], stage: str) -> list[str]:
+    """Limits that the nominal arm, or the arm as found, does not meet: on held-out data if there are any."""
+    names = []
+    for name, limit in maxima.items():
+        for group in _GROUPS:
+            values = (summary[group] or {}).get(stage, {})
+            key = "observed_rms_mm" if name == "rms_mm" and "observed_rms_mm" in values else name
+            if key in values:
+                names += [f"{_LIMITED[name]}: {values[key]:.3g} mm"] if values[key] > limit else []
+                break
+    return names
+
+
 def _judged(subject: str, limit: float, chance: float, more: str) -> Judged:
     if chance >= 1 - _RISK:
         return Judged("conforms", f"{subject}, within the limit of {limit:g} mm.")

@@ -156,6 +156,7 @@ def evaluation_verdict(summary: Mapping[str, Any], own_warnings: int = 0) -> Ver
         says += f" ({shorten(list(dict.fromkeys(names)))})" if names else ""
         for stage, words in (("nominal", "the nominal arm"), ("as_found", "the arm as found")):
             failed = [name for name, decision in before[stage].items() if decision == "fails"]
+            failed += summary.get("failed_before", {}).get(stage, [])
             says += f"; {words} fails ({shorten(failed)})" if failed else ""
         says += f"; no limit was given for {shorten(list(without))}" if without else ""
         says += "; the procedure of a test was not complete." if incomplete else "."

@@ -8,6 +8,7 @@ from ..uncertainty.coverage import LEVEL_IN_PERCENT, U_AT_LEVEL
 from .tables import STYLES, Styled, Table, View, listed, plain, warnings_of
 
 VERDICT_MARKS = {"better": "good", "good": "good", "worse": "bad", "not good": "bad", "equivalent": "neutral"}
+_LIKELY = 0.7  # of a limit: errors that D-H parameters do not describe come on top of a predicted RMS error
 _LITTLE = 0.1  # of the RMS error: a smaller gain of a recalibration is none
 _RMS_ERROR = (
     "RMS error: RMS distance of a pose from its socket, point or board position, after the tip of the tool and the "
@@ -19,9 +20,13 @@ _REAL_SHARE = (
 )
 
 
-def verification_summary(checked: Verification, arm: str, delivered: str, scaled: bool = True) -> dict[str, Any]:
+def verification_summary(
+    checked: Verification, arm: str, delivered: str, scaled: bool = True, max_rms: float | None = None
+) -> dict[str, Any]:
     """What ``verify`` reports of the nominal arm and the delivered parameters with these names, mm; ``scaled`` says
-    whether a certified length, a board or an instrument tests the scale."""
+    whether a certified length, a board or an instrument tests the scale, and ``max_rms`` which RMS error the task
+    allows."""
+    enough = None if max_rms is None or checked.mismatch else _enough(checked.delivered, max_rms)
     rows = [
         {"parameters": name} | _accuracy(accuracy) | {"length_errors_mm": plain(errors)}
         for name, accuracy, errors in (
@@ -35,7 +40,10 @@ def verification_summary(checked: Verification, arm: str, delivered: str, scaled
         "arm": arm,
         "delivered": delivered,
         "verdict": checked.verdict,
-        "says": _verdict(checked),
+        "max_rms_mm": max_rms,
+        "enough": enough,
+        "says": _verdict(checked) if max_rms is None or enough is None else _for_task(checked, max_rms, enough),
+        "do": _to_do(checked, enough),
         "accuracy": [rows[1] | {"parameters": "delivered (nominal)"}] if checked.same else rows,
         "share": dict(zip(("value", "lower", "upper"), share, strict=True)),  # of no difference there is none
         "volume_ratio": {"lower": checked.ratio_lower, "upper": checked.ratio_upper, "margin": MARGIN},
@@ -52,6 +60,8 @@ def verification_summary(checked: Verification, arm: str, delivered: str, scaled
         "gain_says": _gain(checked),
         "warnings": list(checked.warnings),
         "data_match": not checked.mismatch,
+        "achieved": not checked.mismatch
+        and (checked.verdict not in ("worse", "not good") if enough is None else enough == "yes"),
         "not_tested": [*_NOT_TESTED, *([] if scaled else ["the scale of the arm: no length is known"])],
     }
 
@@ -72,6 +82,33 @@ def _accuracy(accuracy: Accuracy) -> dict[str, Any]:
         "upper_mm": accuracy.upper,
         "degrees_of_freedom": accuracy.degrees_of_freedom,
     }
+
+
+def _enough(error: Accuracy, limit: float) -> str:
+    """Whether an RMS error is within a limit, by the interval at `coverage.LEVEL`."""
+    return "yes" if error.upper <= limit else "no" if error.lower > limit else "not decided"
+
+
+def _for_task(checked: Verification, limit: float, enough: str) -> str:
+    """Whether the delivered parameters do for a task, and if not whether a calibration would; then the verdict."""
+    beyond = int((checked.distances[1] > limit).sum())
+    after = ""
+    if enough != "yes":
+        can = "would probably meet it" if checked.recalibrated <= _LIKELY * limit else "would probably not meet it"
+        after = f"; a calibration {can} (at least {checked.recalibrated:.2g} mm)"
+    answer = {"yes": "Good enough", "no": "Not good enough", "not decided": "Not decided whether good enough"}[enough]
+    return f"{answer} for {limit:g} mm RMS: {beyond} of {checked.poses} poses beyond it{after}. {_verdict(checked)}"
+
+
+def _to_do(checked: Verification, enough: str | None) -> str:
+    """What to do, in a few words."""
+    if checked.mismatch:
+        return "correct the recording or the manifest"
+    if enough == "no" or (enough is None and checked.verdict in ("worse", "not good")):
+        return "calibrate"
+    if enough == "not decided" or (enough is None and checked.verdict == "not decided"):
+        return "record more poses in other places"
+    return "keep either" if checked.verdict == "equivalent" else "keep the parameters"
 
 
 def _verdict(checked: Verification) -> str:
@@ -107,7 +144,7 @@ def _verdict(checked: Verification) -> str:
 def _poses(checked: Verification) -> str:
     """How many poses decide."""
     if checked.mismatch:
-        return "Correct the recording or the manifest first (see the warnings), then verify again."
+        return ""
     errors = f"(of two equally good sets, {50 * LEVEL:g} % are called better and {50 * LEVEL:g} % worse)"
     if checked.same:
         alone = "The delivered parameters are the nominal ones, so that they are compared with a calibration only."
@@ -179,10 +216,16 @@ def meaning(summary: dict[str, Any]) -> str:
     return _RMS_ERROR if summary["share"]["value"] is None else f"{_RMS_ERROR} {_REAL_SHARE}"
 
 
+def mark_of(summary: dict[str, Any]) -> str:
+    """The mark of the verdict: for the task, where its largest error was stated."""
+    marks = {"yes": "good", "no": "bad", "not decided": "unsure"}
+    return marks.get(summary["enough"]) or VERDICT_MARKS.get(summary["verdict"], "unsure")
+
+
 def verification(summary: dict[str, Any]) -> View:
     """What people see of it."""
-    yield Styled(summary["says"], STYLES[VERDICT_MARKS.get(summary["verdict"], "unsure")])
-    yield from filter(None, (summary["poses_say"], summary["gain_says"]))
+    yield Styled(summary["says"], STYLES[mark_of(summary)])
+    yield from filter(None, (f"To do: {summary['do']}.", summary["poses_say"], summary["gain_says"]))
     yield from warnings_of(summary)
     yield accuracy_table(summary)
     yield counted(summary)

@@ -43,7 +43,7 @@ def test_a_good_and_a_bad_delivery(aacmm, robot):
     aacmm("verify", "poses.toml", "--delivered", "nominal.toml", "-o", "page.html", expect=1)
     page = (robot / "page.html").read_text("utf-8")
     for part in (
-        "<b>Not good</b>",
+        "<b>Not good (calibrate)</b>",
         "at least",
         "tip fitted",
         "What was not tested",
@@ -69,7 +69,7 @@ def test_data_that_do_not_match_the_arm_get_no_verdict(aacmm, robot, unit, lengt
     assert printed.startswith("Not decided: ")
     for text in (printed, page):
         assert warning in " ".join(text.split())
-    assert "<b>Not decided</b>" in page
+    assert "<b>Not decided (correct the recording or the manifest)</b>" in page
     assert "After a calibration" not in page
 
 

@@ -131,6 +131,14 @@ def test_the_same_parameters_are_compared_with_a_calibration():
         r"Not good: .* with the tip fitted; a calibration .* at least .* mm: calibrate\.", summary["says"]
     )
     assert any("scale" in part for part in summary["not_tested"])
+    low, high = bad.delivered.lower, bad.delivered.upper
+    for limit, enough, does in ((0.9 * low, "no", "calibrate"), (1.01 * high, "yes", "keep the parameters")):
+        judged = verification_summary(bad, "", "", max_rms=limit)
+        assert (judged["enough"], judged["achieved"], judged["do"]) == (enough, enough == "yes", does)
+        beyond = int((bad.distances[1] > limit).sum())
+        assert f"ood enough for {limit:g} mm RMS: {beyond} of 24 poses beyond it" in judged["says"]
+    between = verification_summary(bad, "", "", max_rms=(low + high) / 2)
+    assert (between["enough"], between["achieved"]) == ("not decided", False)
 
 
 def drawn(random: np.random.Generator, share: float, clusters: int = 12) -> tuple[_Rows, _Rows]:

@@ -163,6 +163,10 @@ def test_situations(summary, mark, begins, code):
         (evaluated("conforms", failed=["RMS is 2 mm, over."]), 0, "bad", "Fails: RMS is 2 mm, over."),
         (evaluated("conforms", "undecided"), 0, "unsure", "too uncertain for a decision on E_1"),
         (evaluated(kept=["RMS is 2 mm."]), 0, "good", "Conforms"),
+        (
+            evaluated(kept=["RMS is 2 mm."]) | {"failed_before": {"nominal": ["RMS distance: 3 mm"], "as_found": []}},
+            *(0, "good", "Conforms: all limits given are met; the nominal arm fails (RMS distance: 3 mm)."),
+        ),
         (evaluated(), 0, "neutral", "Measured; no limit was given."),
         (
             evaluated(held_out=held_out(0.001)),

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from ...core.arguments import checked_arguments
 from ...core.rotations import roll_pitch_yaw
 from ...core.units import DEG
+from ...data.recording import RecordedAs
 from ...kinematics.arm import Arm, by_joint, correction_names, parameter_unit, value_of, without_corrections
 from ...kinematics.axes_to_dh import Transform, canonical_origins, geometry_of
 from ...kinematics.chain import Geometry
@@ -73,13 +74,16 @@ def dh_table(
     return "\n".join(lines) + "\n"
 
 
-def python_program(arm: Arm, *, title: str, base: Transform | None = None) -> str:
+def python_program(
+    arm: Arm, *, title: str, base: Transform | None = None, recorded_as: RecordedAs | None = None
+) -> str:
     """A Python program of the arm that needs NumPy only: ``position(q)`` and ``pose(q)``, mm and rad.
 
     Args:
         arm: One arm.
         title: The first line of its documentation.
         base: The first frame in a robot's base link, mm; poses are in the base link then.
+        recorded_as: How readings are written; the program has ``position_of_readings(readings)`` then.
 
     Example:
         >>> program = aj.files.python_program(result.arm, title="Calibrated arm")
@@ -94,8 +98,16 @@ def python_program(arm: Arm, *, title: str, base: Transform | None = None) -> st
     constants = [f"{name} = [{row_of(row, ', ')}]" for name, row in values.items()]
     constants.append(f"PRISMATIC = {by_joint(arm, False, True)}")
     rows = ",\n".join(f"    [{row_of(row, ', ')}]" for row in (np.eye(4) if base is None else base))
-    template = Path(__file__).parents[1] / "templates" / "program.txt"
-    return template.read_text("utf-8").format(title=repr(title), base=rows, constants="\n".join(constants))
+    templates = Path(__file__).parents[1] / "templates"
+    program = (templates / "program.txt").read_text("utf-8")
+    program = program.format(title=repr(title), base=rows, constants="\n".join(constants))
+    if recorded_as is None:
+        return program
+    names, unit, factors, offsets = recorded_as
+    rows = ",\n".join(f"    [{row_of(row, ', ')}]" for row in factors)
+    columns = ",\n".join(f"    {name!r}" for name in names)
+    of_readings = (templates / "program_readings.txt").read_text("utf-8")
+    return program + of_readings.format(columns=columns, unit=repr(unit), factors=rows, offsets=row_of(offsets, ", "))
 
 
 def _beta(geometry: Geometry) -> Float[np.ndarray, " n"]:
