@@ -175,8 +175,8 @@ def test_limits_that_the_proposed_zeros_keep_are_no_warning(aacmm, tmp_path, few
     q = np.random.default_rng(2).uniform(low + 0.2, high - 0.2, (20, 5))
     q[:4, 1] += 4.0 * warned  # rad, beyond the limits of joint 2
     rows = np.hstack([np.degrees(q) - [0, zero, 0, 0, 0], np.asarray(arm.position(q))])
-    write(tmp_path / "p.csv", [*(f"J{i}" for i in range(1, 6)), "x", "y", "z"], rows)
-    tables = 'angles = { unit = "deg", columns = "J*" }\n[[points]]\nfile = "p.csv"\n'
+    write(tmp_path / "p.csv", [*(f"J{i}" for i in range(1, 6)), "x_mm", "y_mm", "z_mm"], rows)
+    tables = 'angles = { unit = "deg", columns = "J*" }\n[[points]]\nfile = "p.csv"\ncolumns = { points = "*_mm" }\n'
     (tmp_path / "m.toml").write_text(f'arm = "so100"\n{tables}')
     found = json.loads(aacmm("import", "m.toml", "--check", "--json").stdout)
     assert found["check"]["fits"] is warned
