@@ -299,8 +299,7 @@ def test_a_report_of_observations_by_kind_observation_and_pose(observed_record, 
     assert weights.rows[0][3].value > 1
     certified = [[cell.text for cell in row[:3]] for row in tables["Certified values"].rows]
     assert ["bar", "certified coordinates of far", "(300.0000, 0.0000, 0.0000) mm"] in certified
-    found_table = next(table for caption, table in tables.items() if caption.startswith("Geometry found"))
-    assert "R x + origin" in found_table.caption
+    found_table = tables["Geometry found (a frame takes its points x to R x + origin)"]
     geometry = {(row[0].text, row[1].text): row[2].text for row in found_table.rows}
     assert geometry["plane block", "normal"].endswith(", 1.000000)")
     assert geometry["frame of tracker", "rotation vector"].endswith(" deg")
