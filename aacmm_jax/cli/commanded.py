@@ -6,6 +6,10 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..core.text import printable
+from ..data.recording import RecordedAs
+from ..files.inputs import InputFile
+from ..files.text_lines import Column
+from ..files.text_table import TextTable
 from .arm_command import first_frame
 from .options import numbers_option
 
@@ -124,3 +128,23 @@ def in_first_frame(record: Any, poses: np.ndarray) -> np.ndarray:
     """Poses in the frame in which the Denavit-Hartenberg chain begins; of a URDF they are given in its base link."""
     urdf = record.recording.nominal.urdf
     return poses if urdf is None else np.linalg.inv(first_frame(record.recording.nominal)) @ poses
+
+
+def written_as(record: Any, unit: str | None) -> RecordedAs:
+    """How the readings of a calibration were recorded, for ``--as-recorded``. Raises `InputError` where it is not
+    known."""
+    if unit is not None:
+        raise InputError("--as-recorded applies the unit of the recording; leave out --unit.")
+    if record.recording.recorded_as is None:
+        raise InputError(
+            "--as-recorded needs to know how the readings were recorded, but the calibration does not contain it, as "
+            "those of simulations, robots of several chains, several captures or corrected readings; calibrate from "
+            "one manifest, or give joint values without --as-recorded."
+        )
+    return record.recording.recorded_as
+
+
+def columns_as_recorded(file: InputFile, written: RecordedAs) -> list[Column] | None:
+    """The columns of the recording, where a table has columns of such names."""
+    table = TextTable(file)
+    return list(written.names) if table.header and table.has(written.names) else None

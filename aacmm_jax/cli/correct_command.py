@@ -8,18 +8,30 @@ import typer
 
 from .. import files, kinematics, summaries
 from ..core.errors import InputError
+from ..core.units import ANGLE_UNITS
 from ..files.inputs import InputFile
 from ..files.outputs import together, write_text
+from ..kinematics.arm import by_joint
 from . import options
 from .app import command, show_summary, warn_of_unusable
 from .arm_command import first_frame
 from .chains import named_chain
-from .commanded import at_temperature, in_first_frame, named_frame, other_tip, targets_words, tool_tip
-from .options import argument, names_option, numbers_option, option, output
+from .commanded import (
+    at_temperature,
+    columns_as_recorded,
+    in_first_frame,
+    named_frame,
+    other_tip,
+    targets_words,
+    tool_tip,
+    written_as,
+)
+from .options import argument, flag, names_option, numbers_option, option, output
 
 
 @command(
     "aacmm correct calibration.h5 poses.csv -o corrected.csv --unit deg",
+    "aacmm correct calibration.h5 poses.csv -o corrected.csv --as-recorded",
     "aacmm correct robot.h5 left.csv -o corrected.csv --unit deg --chain left",
     "aacmm correct calibration.h5 points.csv -o commanded.csv --unit deg --near 0,-90,90,0,90,0 --write poses",
     "aacmm correct calibration.h5 poses.csv -o corrected.csv --unit deg --near 0,-90,90,0,90,0 --probe 0,0,150",
@@ -42,6 +54,11 @@ def correct(
         "Columns of the joint readings if they are not named q_1, q_2, ...: names, a pattern, or column numbers from "
         "1, separated by commas. Default: all columns, if the table has exactly one column per joint.",
         "NAMES",
+    ),
+    as_recorded: bool = flag(
+        "--as-recorded",
+        "The joint readings, and so the corrected ones, are as in the recording: its unit, signs, offsets and names of "
+        "columns apply.",
     ),
     length_unit: Literal["mm", "m", "um", "inch"] | None = option(
         "Unit of positions if the column header does not state it (as x_m does). Default: mm."
@@ -91,8 +108,8 @@ def correct(
     possible; with fewer than six joints, only the position is corrected. Rotations of the tool that the calibration
     data do not determine stay nominal.
 
-    The readings are those of the nominal arm. The signs and offsets that a manifest gives for the recorded angles of a
-    capture are not applied.
+    The readings are joint values of the nominal arm, unless --as-recorded applies the signs and offsets that the
+    manifest gives for the readings of the capture.
 
     The output table has the columns and the unit of the input table. If the pose of a row cannot be reached within the
     joint limits of the nominal arm, its readings are left empty and the exit code is 1. Do not send an arm to such a
@@ -118,6 +135,10 @@ def correct(
         record = files.load_calibration(InputFile(calibration))
         nominal, calibrated = to_numpy((record.recording.nominal.arm, record.calibrated.arm))
         own = named_chain(nominal, chain)
+        written = written_as(record, unit) if as_recorded else None
+        if written is not None:
+            unit = "deg" if written.unit == "deg" else "rad"
+            picked = picked or columns_as_recorded(InputFile(poses), written)
         if probe is not None:
             tool = tool_tip(record, own, probe)
             nominal, calibrated = nominal.replace(probe=tool), calibrated.replace(probe=tool)
@@ -130,6 +151,11 @@ def correct(
             positions=placed,
             length_unit=length_unit,
         )
+        by_unit = np.array(by_joint(nominal if own is None else own.arm, ANGLE_UNITS[commanded.unit], 1.0))
+        if written is not None:
+            if not commanded.columns:
+                raise InputError(f"--as-recorded applies to joint readings, but {poses} has none; leave it out.")
+            commanded = commanded._replace(q=written.joint_values(commanded.q / by_unit))
         if in_frame is not None and commanded.poses is None:
             raise InputError(
                 f"--in-frame applies to positions, but {poses} has no columns x, y and z; name the columns of the "
@@ -155,6 +181,7 @@ def correct(
             corrected = kinematics.readings_at_poses(calibrated, q, targets, nominal.limits)
             found = np.asarray(corrected.q)
             found = found if own is None else own.of_robot(found)
+            found = found if written is None else written.readings(found) * by_unit
             text = corrected_csv(commanded, found, np.asarray(corrected.reached))
         summary = summaries.correction.correction_summary(
             nominal,

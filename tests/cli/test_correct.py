@@ -49,6 +49,35 @@ def write(path, header: list[str], rows) -> None:
     path.write_text("\n".join([*lines, *(",".join(map(str, row)) for row in rows)]) + "\n")
 
 
+@pytest.mark.parametrize("unit", ["deg", "counts"])
+def test_readings_as_recorded_become_readings_as_recorded(arms, unit):
+    """The same joint values as without signs and offsets; names of columns are those of the recording."""
+    folder, *_ = arms
+    names, size = [f"motor {i}.pos" for i in range(6)], np.array([1, -1, 1, 1, -1, 1]) * (1.001 * DEG)
+    written = aj.data.RecordedAs(tuple(names), unit, np.diag(size), np.linspace(-1, 1, 6))
+    record = aj.files.load_calibration(folder / "calibration.h5")
+    recording = record.recording._replace(recorded_as=written)
+    aj.files.save_calibration(folder / "written.h5", record._replace(recording=recording))
+    write(folder / "in.csv", [f"q_{i}_rad" for i in range(1, 7)], Q)
+    run(arms, "in.csv", "-o", "out.csv")
+    rows = np.hstack([written.readings(Q), np.full((6, 1), 12.5)])
+    write(folder / "raw.csv", [*names, "gripper.pos"], rows)
+    command_line(folder, "correct", "written.h5", "raw.csv", "-o", "c.csv", "--as-recorded", "--overwrite")
+    corrected, expected = table(folder / "c.csv"), table(folder / "out.csv")
+    assert list(corrected[0]) == [*names, "gripper.pos"]
+    raw = np.array([[float(row[name]) for name in names] for row in corrected])
+    np.testing.assert_allclose(
+        written.joint_values(raw), [[float(x) for x in row.values()] for row in expected], atol=1e-9
+    )
+    write(folder / "points.csv", ["x", "y", "z"], [[400, 200, 300]])
+    near = ("--near", "0,0,0,0,0,0", "--as-recorded", "-o", "p.csv")
+    says = command_line(folder, "correct", "written.h5", "points.csv", *near, expect=2).stderr
+    assert "applies to joint readings" in " ".join(says.split())
+    for options, text in ((["--unit", "deg"], "leave out --unit"), ([], "calibrate from one manifest")):
+        says = run(arms, "raw.csv", "-o", "e.csv", "--as-recorded", *options, expect=2).stderr
+        assert text in " ".join(says.split())
+
+
 def test_readings_in_the_columns_and_unit_of_the_table(arms):
     folder, nominal, calibrated = arms
     header = ["name", *(f"q_{i}_deg" for i in range(1, 7)), "speed", "temperature_C"]
