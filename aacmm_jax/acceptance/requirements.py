@@ -129,10 +129,9 @@ def _elbow(measured: Measured) -> str | None:
             < _LEAST_ELBOW
         ):
             bad.append(name)
-    few = f"{_LEAST_ELBOW} poses"
     sentence = (
-        f"Every socket must have {few} with the elbow on the left and {few} with the elbow on the right (fewer "
-        f"in: {', '.join(bad)})."
+        f"Every socket must have {_LEAST_ELBOW} poses with the elbow on the left and {_LEAST_ELBOW} poses with the "
+        f"elbow on the right (fewer in: {', '.join(bad)})."
     )
     return sentence if bad else None
 

@@ -2,7 +2,7 @@
 
 import datetime
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from xml.etree.ElementTree import Element
 
 from ..acceptance.judgement import RULES, Rule, worst
@@ -10,6 +10,7 @@ from ..acceptance.record import EvaluationRecord, same_arm
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
 from ..calibration.record import REPEATABILITY, CalibrationRecord
 from ..core.errors import InputError
+from ..data.capture import names_in
 from ..diagnostics.contradictions import LEFT_OUT
 from ..diagnostics.findings import findings_of
 from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity
@@ -18,9 +19,20 @@ from ..summaries.observations import scale_sources
 from ..uncertainty.coverage import COVERAGE_FACTOR
 from . import xml_elements as xml
 from .measurement_results import results_of, uncertainty_statement
-from .xml_elements import MILLIMETRE, element, english, equipment_quantity, named, optional, real, text
+from .xml_elements import (
+    LEFT_OUT_NAMES,
+    MILLIMETRE,
+    element,
+    english,
+    equipment_quantity,
+    named,
+    optional,
+    real,
+    text,
+)
 
 VERSION = "3.3.0"
+Tests = Mapping[str, Sequence[AcceptanceTest]]  # acceptance tests by the parameters: nominal, as_found, calibrated
 _DECIMALS = 5  # of values of tests without an uncertainty, mm
 
 
@@ -71,7 +83,7 @@ def dcc_xml(
             f"a certificate cannot be issued: k = {record.k:.6g} is not a plausible scale of an arm; correct the "
             "values of the reference lengths and calibrate again."
         )
-    rules = _check_evaluation(record, administrative_data, evaluation)
+    tests = _checked_tests(record, administrative_data, evaluation)
     try:
         day = datetime.datetime.fromisoformat(record.recording.measured or created).date()
     except ValueError as error:
@@ -80,11 +92,11 @@ def dcc_xml(
         ) from error
     root = element(
         "digitalCalibrationCertificate",
-        _administrative(record, administrative_data, day, sources, rules),
+        _administrative(record, administrative_data, day, sources, tests),
         element(
             "measurementResults",
             results_of(record, administrative_data, command, evaluation),
-            None if evaluation is None else _acceptance_results(evaluation),
+            None if evaluation is None else _acceptance_results(evaluation, tests),
         ),
     )
     for name, value in (("xmlns:dcc", xml.DCC), ("xmlns:si", xml.SI), ("xmlns:xsi", xml.XSI)):
@@ -96,24 +108,36 @@ def dcc_xml(
     return xml.xml_text(root)
 
 
-def _check_evaluation(
+def _checked_tests(
     record: CalibrationRecord, administrative_data: AdministrativeData, evaluation: EvaluationRecord | None
-) -> list[Rule]:
-    """Refuse what the evaluation contradicts; the rules by which it was decided."""
+) -> Tests:
+    """The acceptance tests of the evaluation by the parameters; refuse what they contradict."""
     simulated = record.recording.true is not None
     if evaluation is None:
         check_conformity(
             administrative_data, simulated=simulated, needed="give an evaluation with limits (--evaluation)"
         )
-        return []
+        return {}
     if not same_arm(record.calibrated.arm, evaluation.calibrated.arm):
         raise InputError("the evaluation belongs to another calibration; run aacmm evaluate with this calibration.")
     simulated |= evaluation.recording.true is not None
-    tests = evaluation.acceptance()["calibrated"]
-    rules: list[Rule] = [test.rule for test in tests if test.decision is not None]
-    decision = worst([test.decision for test in tests if test.decision is not None])
-    check_conformity(administrative_data, simulated=simulated, decision=decision, rules=rules)
-    return rules
+    tests = evaluation.acceptance()
+    decision = worst([test.decision for test in tests["calibrated"] if test.decision is not None])
+    check_conformity(administrative_data, simulated=simulated, decision=decision, rules=_rules(tests))
+    return tests
+
+
+def _rules(tests: Tests) -> list[Rule]:
+    """The rules by which the calibrated arm was decided."""
+    return [test.rule for test in tests["calibrated"] if test.decision is not None]
+
+
+def _decided_arms(tests: Tests) -> str:
+    """With which parameters conformity is stated, and whether the arm fails with those before."""
+    stage, before = ("as_found", "parameters as found") if "as_found" in tests else ("nominal", "nominal parameters")
+    metrics = [metric.name for test in tests[stage] for metric in test.metrics if metric.decision == "fails"]
+    fails = f" With the {before}, the arm fails ({', '.join(metrics)})." if metrics else ""
+    return f"The statement of conformity holds for the arm with the calibrated parameters.{fails}"
 
 
 def _administrative(
@@ -121,7 +145,7 @@ def _administrative(
     given: AdministrativeData,
     day: datetime.date,
     sources: Sequence[str],
-    rules: Sequence[Rule],
+    tests: Tests,
 ) -> Element:
     """The administrative data, with the unique identifier still empty."""
     name = given.item.name or record.recording.nominal.name or "articulated-arm coordinate measuring machine"
@@ -148,7 +172,7 @@ def _administrative(
         ),
         element("respPersons", persons or element("respPerson", named("person", NOT_STATED))),
         xml.contact("customer", given.customer),
-        element("statements", _statements(record, given, sources, rules)),
+        element("statements", _statements(record, given, sources, tests)),
     )
 
 
@@ -187,7 +211,7 @@ def _core(administrative_data: AdministrativeData, day: datetime.date) -> Elemen
 
 
 def _statements(
-    record: CalibrationRecord, given: AdministrativeData, sources: Sequence[str], rules: Sequence[Rule]
+    record: CalibrationRecord, given: AdministrativeData, sources: Sequence[str], tests: Tests
 ) -> Iterator[Element]:
     if record.recording.true is not None:
         yield _statement("Simulation", "The readings are simulated, so this is not a certificate of a real arm.")
@@ -205,8 +229,10 @@ def _statements(
         yield _statement("Monte Carlo", record.sampled_says, norm="JCGM 101:2008")
     for finding in findings_of(record):
         if finding.code == LEFT_OUT:
-            members = f"Sockets and observations left out: {', '.join(finding.concerns)}."
-            yield _statement("Data left out", f"{finding.sentence} {members}")
+            # Of poses, what was probably done wrong concerns sockets that are not left out.
+            kept = names_in(record.recording.capture)
+            names = ", ".join(name for name in finding.concerns if name not in kept)
+            yield _statement("Data left out", f"{finding.sentence}{LEFT_OUT_NAMES}{names}.")
         else:
             yield _statement("Warning", finding.sentence)
     if sources:
@@ -214,7 +240,8 @@ def _statements(
     if given.conformity is not None:
         stated = given.conformity
         verdict = element("conformity", stated.verdict)
-        yield _statement("Conformity", stated.decided_by(rules), verdict, norm=stated.specification)
+        yield _statement("Conformity", stated.decided_by(_rules(tests)), verdict, norm=stated.specification)
+        yield _statement("Parameters of the conformity", _decided_arms(tests))
     if given.certificate.remarks is not None:
         yield named("statement", "Remarks", text("declaration", given.certificate.remarks))
 
@@ -223,7 +250,7 @@ def _statement(name: str, words: str, verdict: Element | None = None, *, norm: s
     return named("statement", name, optional("norm", norm), english("declaration", words), verdict)
 
 
-def _acceptance_results(record: EvaluationRecord) -> Iterator[Element]:
+def _acceptance_results(record: EvaluationRecord, by_stage: Tests) -> Iterator[Element]:
     """The measurement results of the acceptance tests of an evaluation, if it has any."""
     which = (
         "not used for the calibration."
@@ -239,7 +266,7 @@ def _acceptance_results(record: EvaluationRecord) -> Iterator[Element]:
         "measuringEquipment", "Artefacts of the tests", element("measuringEquipmentQuantities", quantities)
     )
     artefacts = element("measuringEquipments", artefacts) if values else None
-    for stage, tests in record.acceptance().items():
+    for stage, tests in by_stage.items():
         if not tests:
             continue
         formulas = "Formulas and requirements are taken from secondary sources."
@@ -247,7 +274,7 @@ def _acceptance_results(record: EvaluationRecord) -> Iterator[Element]:
             "The uncertainty includes only the contributions of the tester (ISO 14253-5), combined as independent "
             "contributions."
         )
-        data = element("data", english("text", _influences(record)))
+        data = element("data", english("text", _influences(record)), _stated_u(record))
         condition = named("influenceCondition", "Uncertainty of the test", xml.adjustment_status(stage), data)
         editions = dict.fromkeys(test.called for test in tests)
         evaluation = "Evaluation of the uncertainty of the tests"
@@ -269,16 +296,21 @@ def _acceptance_results(record: EvaluationRecord) -> Iterator[Element]:
 
 def _influences(record: EvaluationRecord) -> str:
     given = record.influences
-    parts = [f"Standard uncertainty of seat and fixture: {1000 * record.u_test:.3g} um"]
-    if given.u_relative:
-        parts.append(f"in proportion to the length: {given.u_relative:.3g}")
+    parts = []
     for name, body in (("artefact", given.artefact), ("arm", given.arm)):
         if body is not None:
             parts.append(
-                f"the {name} expands by {body.coefficient:.4g} / K (u = {body.u_coefficient:.2g} / K), at "
-                f"{body.temperature:g} C (u = {body.u_temperature:g} C); lengths are corrected for this expansion"
+                f"The {name} expands by {body.coefficient:.4g} / K (u = {body.u_coefficient:.2g} / K), at "
+                f"{body.temperature:g} C (u = {body.u_temperature:g} C); lengths are corrected for this expansion."
             )
-    return "; ".join(parts) + ". The arm's own scatter is not included, because it is what is tested."
+    return " ".join([*parts, "The arm's own scatter is not included, because it is what is tested."])
+
+
+def _stated_u(record: EvaluationRecord) -> Iterator[Element]:
+    """Standard uncertainties of the test besides those of its artefacts."""
+    yield named("quantity", "Standard uncertainty of seat and fixture", real(record.u_test, MILLIMETRE))
+    if record.influences.u_relative:
+        yield named("quantity", "Standard uncertainty per length", real(record.influences.u_relative, xml.ONE))
 
 
 def _test(test: AcceptanceTest, judged: bool) -> Element:

@@ -5,6 +5,7 @@ import fnmatch
 import itertools
 import math
 from collections.abc import Iterator, Sequence
+from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -24,6 +25,7 @@ from ..diagnostics.pose_residuals import ObservationResiduals, distances_of, obs
 from ..files.administrative_data import NOT_STATED, AdministrativeData, Reference
 from ..pipeline.hold_out import residuals_of
 from ..summaries.calibration import metrics_by_socket_and_length, prior_rows, prior_sentence
+from ..summaries.evaluation import evaluation_summary
 from ..summaries.observations import distances_row, less_weight
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.coverage import LEVEL, LEVEL_IN_PERCENT
@@ -50,8 +52,11 @@ _OVER_VOLUME = {"Tip position": "expanded_tip", "Measured length": "expanded_len
 _HELD_OUT = {
     "rms_mm": "RMS distance",
     "largest_mm": "largest distance",
+    "from_mean_mm": "largest distance from the mean position",
     "rms_predicted_mm": "RMS distance, predicted",
 }
+# Lengths that no reference stands for, of the calibration and of the test, and how names of the latter begin.
+LENGTHS_OF_NONE, OF_TEST = ("Reference lengths", "Lengths of the test"), "Test "
 _MEASURED = {
     "mm": "standard uncertainty of a measured coordinate or distance",
     "rad": "standard uncertainty of a measured angle or orientation about each axis",
@@ -174,10 +179,11 @@ def _equipment(
             artefact.append(_quantities(lengths, names))
             assigned.update(names)
         yield artefact
-    fitted = itertools.islice(lengths, len(record.recording.capture.lengths))
-    if others := [name for name in fitted if name not in assigned]:
-        unknown = "" if references else f"Artefact: {NOT_STATED}"
-        yield named("measuringEquipment", "Reference lengths", _quantities(lengths, others), says=unknown)
+    unknown = "" if references else f"Artefact: {NOT_STATED}"
+    for of_test, name in enumerate(LENGTHS_OF_NONE):
+        others = [key for key in lengths if key not in assigned and key.startswith(OF_TEST) == of_test]
+        if others:
+            yield named("measuringEquipment", name, _quantities(lengths, others), says=unknown)
     # Observations with the same certified values are of one artefact in several placements, which is named once.
     equipment: dict[tuple, tuple[list[str], str, list[Quantity]]] = {}
     for part in residuals:
@@ -213,7 +219,7 @@ def _certified_lengths(record: CalibrationRecord, evaluation: EvaluationRecord |
     lengths: list[tuple[str, Sequence[ReferenceLength]]] = [("", record.recording.capture.lengths)]
     if evaluation is not None:
         tested = evaluation.recording.capture.lengths
-        lengths.append(("Test ", [tested[i] for i in evaluation.held_out_lengths()]))
+        lengths.append((OF_TEST, [tested[i] for i in evaluation.held_out_lengths()]))
     return {f"{of}{_length_name(i, x)}": x for of, rows in lengths for i, x in enumerate(rows, start=1)}
 
 
@@ -289,21 +295,38 @@ def _results(
 
 
 def _held_out(record: CalibrationRecord, evaluation: EvaluationRecord | None) -> Element | None:
-    """Distances of held-out poses; of those of an evaluation where the calibration has none."""
+    """Distances of held-out poses; of those of an evaluation, as its summary has them, where the calibration has
+    none."""
     says = "Distances of the tip from the geometry, in poses that the parameters were not identified from."
-    source = record if record.held_out is not None else evaluation
-    if source is evaluation:
+    row = None
+    if record.held_out is not None:
+        row = distances_row(residuals_of(record).used_as(HELD_OUT))
+    elif evaluation is not None and evaluation.uncertainty is not None:
         says += " The positions of the sockets, and other geometry, were determined from these poses."
-    if source is None or (isinstance(source, EvaluationRecord) and source.uncertainty is None):
+        row = _unseen_row(evaluation_summary(evaluation, {"calibrated": []})["held_out"])
+    if row is None:
         return None
-    row = distances_row(residuals_of(source).used_as(HELD_OUT))
-    values = [("poses", row["poses"], ONE), *((name, row[key], MILLIMETRE) for key, name in _HELD_OUT.items())]
+    values = [
+        ("poses", row["poses"], ONE),
+        *((name, row[key], MILLIMETRE) for key, name in _HELD_OUT.items() if key in row),
+    ]
     quantities = (
         named("quantity", name, real(value, unit, decimals=0 if unit == ONE else 6))  # printed to three digits
         for name, value, unit in values
         if value is not None
     )
     return result("Held-out poses", says, quantities) if row["poses"] else None
+
+
+def _unseen_row(held_out: dict[str, Any] | None) -> dict[str, Any] | None:
+    """Distances of held-out poses as the summary of an evaluation has them. Where there are sockets alone, the largest
+    is one from a mean position."""
+    if held_out is None:
+        return None
+    by_arm = held_out["calibrated"]
+    key = "largest_mm" if "observed_largest_mm" in by_arm else "from_mean_mm"
+    largest = by_arm.get("observed_largest_mm", by_arm.get("distance_largest_mm"))
+    return held_out["predicted"]["poses"] | {key: largest}
 
 
 def _volume(record: CalibrationRecord, uncertainty: Uncertainty) -> Element | None:

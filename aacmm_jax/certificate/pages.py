@@ -115,17 +115,12 @@ def _first_page(
     condition = after.find("dcc:influenceConditions/dcc:influenceCondition/dcc:data/dcc:quantity", PREFIXES)
     celsius = words("not_stated") if condition is None else with_u(condition, words)
     yield Section(words("conditions"), [(words("temperature"), celsius)])
-    headings = "artefact", "manufacturer", "serial_number", "certificate_number", "certified"
-    table = [_equipment(x, words) for x in after.iterfind("dcc:measuringEquipments/*", PREFIXES)]
-    stated = [i for i in range(len(headings)) if i in (0, len(headings) - 1) or any(row[i] for row in table)]
-    yield Section(
-        words("traceability"),
-        paragraphs=[words("traceability_sentence")],
-        headings=[words(headings[i]) for i in stated],
-        table=[[row[i] or "–" for i in stated] for row in table[:MOST_ROWS]],
-        texts=len(stated),
-        notes=more(len(table) - MOST_ROWS, words),
-    )
+    equipment = after.findall("dcc:measuringEquipments/*", PREFIXES)
+    of_test = [*filter(_only_of_test, equipment)]
+    rest = [x for x in equipment if x not in of_test]
+    yield _traceability(words("traceability"), rest, words, [words("traceability_sentence")])
+    if of_test:
+        yield _traceability(words("test_equipment"), of_test, words)
     reservations = [
         content(statement, "dcc:declaration") if words.code == "en" else words(key)
         for name, key in _RESERVATIONS.items()
@@ -151,14 +146,35 @@ def _first_page(
     )
 
 
+def _traceability(title: str, equipment: list[Element], words: Language, paragraphs: Sequence[str] = ()) -> Section:
+    headings = "artefact", "manufacturer", "serial_number", "certificate_number", "certified"
+    table = [_equipment(x, words) for x in equipment]
+    stated = [i for i in range(len(headings)) if i in (0, len(headings) - 1) or any(row[i] for row in table)]
+    return Section(
+        title,
+        paragraphs=paragraphs,
+        headings=[words(headings[i]) for i in stated],
+        table=[[row[i] or "–" for i in stated] for row in table[:MOST_ROWS]],
+        texts=len(stated),
+        notes=more(len(table) - MOST_ROWS, words),
+    )
+
+
+def _only_of_test(equipment: Element) -> bool:
+    """Whether an artefact has lengths, and these are of the test alone."""
+    names = [content(x, "dcc:name") for x in equipment.iterfind("dcc:measuringEquipmentQuantities/*", PREFIXES)]
+    return bool(names) and all((length := _OF_LENGTH.fullmatch(x)) and length["test"] for x in names)
+
+
 def _equipment(equipment: Element, words: Language) -> list[str]:
     name = content(equipment, "dcc:name")
     quantities = equipment.findall("dcc:measuringEquipmentQuantities/*", PREFIXES)
+    mixed = not _only_of_test(equipment)
     values: dict[str, list[str]] = {}  # names of lengths by what is certified of them
     for quantity in quantities:
         length = _OF_LENGTH.fullmatch(content(quantity, "dcc:name"))
         value = with_u(quantity, words)
-        value = f"{words('test')}: {value}" if length and length["test"] else value
+        value = f"{words('test')}: {value}" if mixed and length and length["test"] else value
         values.setdefault(value, []).append(length["name"] if length else "")
     texts = [f"{names[0]}:\u00a0{value}" if len(names) == 1 and names[0] else value for value, names in values.items()]
     maker = content(equipment, "dcc:manufacturer/dcc:name"), equipment.findtext("dcc:model", "", PREFIXES)

@@ -15,6 +15,7 @@ from .sections import (
     content,
     expanded_of,
     first,
+    in_degrees,
     more,
     named_in,
     number_of,
@@ -22,10 +23,10 @@ from .sections import (
     value_of,
     without_u,
 )
-from .xml_elements import PREFIXES
+from .xml_elements import LEFT_OUT_NAMES, PREFIXES
 
 _MOST_FINDINGS, _MOST_JOINTS = 4, 8  # the certificate has two pages
-_MOST_CHARACTERS, _MOST_MISSING = 280, 100  # of a finding, and of what a procedure lacks
+_MOST_CHARACTERS, _MOST_MISSING = 280, 130  # of a finding, and of what a procedure lacks
 _COLUMNS = ("alpha", "a", "d", "theta", "beta")
 _STAGES = {"nominal": "nominal parameters", "as_found": "parameters as found", "after": "calibrated parameters"}
 # Of verdicts, the worst first.
@@ -43,11 +44,12 @@ def results_page(results: dict[str, Element], statements: dict, words: Language)
     yield from _volume(stages[1], words)
     yield from _parameters(stages[1], words("parameters"), words)
     yield from _parameters(stages[0], words("parameters_before", before=words(before)), words)
-    tests = [named_in(results.get(f"Acceptance tests, {_STAGES[stage]}"), "dcc:results/dcc:result")
-             for stage in (before, "after")]  # fmt: skip
+    both = [results.get(f"Acceptance tests, {_STAGES[stage]}") for stage in (before, "after")]
+    tests, u_test = [named_in(stage, "dcc:results/dcc:result") for stage in both], _u_test(both[1], words)
     called = dict.fromkeys(name.partition(": ")[0] for name in tests[1])
     for standard in called:
-        yield _tests(standard, tests[0], tests[1], before, words)
+        yield _tests(standard, tests[0], tests[1], before, u_test, words)
+        u_test = ""  # said once
     norms = {
         norm.text: None for test in tests[1].values() for norm in test.iterfind(".//dcc:metaData/dcc:norm", PREFIXES)
     }
@@ -56,7 +58,7 @@ def results_page(results: dict[str, Element], statements: dict, words: Language)
         rule = content(stated, "dcc:declaration")
         facts = [
             (words("specification"), stated.findtext("dcc:norm", "", PREFIXES)),
-            (words("verdict"), words(stated.findtext("dcc:conformity", "", PREFIXES))),
+            (words("verdict"), _verdict(stated, tests[0].values(), before, words)),
         ]
     for key, text in RULES.items():
         rule = rule.replace(text, words(key))
@@ -64,6 +66,15 @@ def results_page(results: dict[str, Element], statements: dict, words: Language)
         facts[1:1] = [(words("decision_rule"), rule), (words("limits"), _limits(tests[1].values(), words))]
     yield Section(words("conformity"), facts, [] if facts else [words("no_conformity_sentence")])
     yield from _findings(statements, words)
+
+
+def _verdict(stated: Element, earlier: Iterable[Element], before: str, words: Language) -> str:
+    """The verdict, that it is of the calibrated parameters, and whether the arm fails with those before."""
+    verdict = words("verdict_sentence", verdict=words(stated.findtext("dcc:conformity", "", PREFIXES)))
+    metrics = (part for test in earlier for part in named_in(test, "dcc:data/dcc:list").items())
+    fails = [symbol for symbol, metric in metrics
+             if any(_limit(x)[1] == "fail" for x in metric.iterfind("dcc:quantity", PREFIXES))]  # fmt: skip
+    return "; ".join([verdict, *([words(f"fails_{before}_sentence", metrics=", ".join(fails))] if fails else [])])
 
 
 def _limits(tests: Iterable[Element], words: Language) -> str:
@@ -87,10 +98,22 @@ def _findings(statements: dict, words: Language) -> Iterator[Section]:
         notes = [_beginning(sentences) for sentences in found[:_MOST_FINDINGS]]
         notes += more(len(found) - _MOST_FINDINGS, words)
     else:
-        notes = [words("left_out_sentence")] if left_out else []
+        names = (name for says in left_out for name in says.rpartition(LEFT_OUT_NAMES)[2].removesuffix(".").split(", "))
+        notes = [words("left_out_sentence", names=_by_socket(names, words))] if left_out else []
         notes += [words.counted("warnings_sentence", str(len(warnings)))] if warnings else []
     if notes:
         yield Section(words("findings"), notes=notes)
+
+
+def _by_socket(names: Iterable[str], words: Language) -> str:
+    """Names of what was left out, with the numbers of poses behind their socket: "T2, C (poses 1, 2)"."""
+    poses: dict[str, list[str]] = {}
+    for name in names:
+        of_pose = re.fullmatch(r"(.*) pose (\d+)", name, flags=re.DOTALL)
+        socket, number = of_pose.groups() if of_pose else (name, "")
+        poses.setdefault(socket, []).extend(filter(None, [number]))
+    texts = [f"{socket} ({words('poses')} {', '.join(x)})" if x else socket for socket, x in poses.items()]
+    return ", ".join([*texts[:MOST_ROWS], *([f"+ {len(texts) - MOST_ROWS}"] if len(texts) > MOST_ROWS else [])])
 
 
 def _beginning(text: str) -> str:
@@ -194,9 +217,8 @@ def _parameters(stage: dict[str, Element], title: str, words: Language) -> Itera
     shown, factors = {}, set()
     for name in (f"{key}_{i}" for key in (*_COLUMNS, "probe") for i in (*numbers, *"xyz")):
         if joints <= _MOST_JOINTS and name in quantities:
-            expanded, factor = expanded_of(quantities[name])
-            text = words.number(value_of(quantities[name]))
-            shown[name] = f"{text} ± {words.number(expanded)}" if expanded else text
+            (value, expanded), factor = in_degrees(quantities[name]), expanded_of(quantities[name])[1]
+            shown[name] = words.number(f"{value} ± {expanded}" if expanded else value)
             factors |= {float(factor)} if factor else set()
     zero = all(shown.get(f"beta_{i}", "") in ("", words.number("0.0")) for i in numbers)
     columns = _COLUMNS[:-1] if zero else _COLUMNS
@@ -219,7 +241,7 @@ def _parameters(stage: dict[str, Element], title: str, words: Language) -> Itera
 
 
 def _tests(
-    standard: str, earlier: dict[str, Element], tests: dict[str, Element], before: str, words: Language
+    standard: str, earlier: dict[str, Element], tests: dict[str, Element], before: str, u_test: str, words: Language
 ) -> Section:
     """The worst value of each metric of the tests by a standard, whose names are "standard: title"."""
     edition = standard.removeprefix("based on ")
@@ -245,11 +267,12 @@ def _tests(
             ]
             says = words("metric_" + re.split("[.:]", symbol)[0])
             rows.append([symbol, says, *numbers, words(verdict) if verdict else "–"])
-    sentences, lacking = [words("tests_sentence", factor=words.number(next(iter(factors), "2")))], " ".join(missing)
+    factor = words.number(next(iter(factors), "2"))
+    sentences = [words("tests_sentence", factor=factor, u=u_test)] if u_test else []
     if incomplete:
-        short = words.code == "en" and len(lacking) <= _MOST_MISSING
+        lacking = words.translated(" ".join(missing))
         sentences.append(words("incomplete_sentence", standard=edition))
-        sentences.append(lacking if short else words("missing_sentence"))
+        sentences.append(lacking if 0 < len(lacking) <= _MOST_MISSING else words("missing_sentence"))
     return Section(
         words("tests", standard=words("based_on", standard=edition) if incomplete else edition),
         headings=[words("quantity"), "", words(before), words("after"), "U", words("limit"), words("decision")],
@@ -257,6 +280,13 @@ def _tests(
         texts=2,
         notes=[" ".join(sentences)],
     )
+
+
+def _u_test(tests: Element | None, words: Language) -> str:
+    """The standard uncertainty that seat and fixture add to values of a test: "0.002 mm", "0.002 mm, 1e-06 L"."""
+    condition = "dcc:influenceConditions/dcc:influenceCondition/dcc:data/dcc:quantity"
+    numbers = (number_of(x, words) for x in named_in(tests, condition).values())
+    return ", ".join(f"{x} {unit}" for x, unit in zip(numbers, ("mm", "L"), strict=False)).replace(" ", "\u00a0")
 
 
 def _limit(quantity: Element) -> tuple[str, str]:

@@ -1,5 +1,6 @@
 """Parts of a printed page, and what is read for them from a Digital Calibration Certificate (DCC)."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
@@ -64,6 +65,19 @@ def shortened(text: str) -> str:
         return text
     short = f"{float(text):.7g}" if abs(float(text)) >= _LEAST else "0.0"
     return short if {*".e"} & {*short} else f"{short}.0"
+
+
+def in_degrees(quantity: Element) -> tuple[str, str]:
+    """Value and expanded uncertainty ("" where there is none); angles in degrees, with two digits of U or else seven
+    of the value."""
+    value, expanded = value_of(quantity), expanded_of(quantity)[0]
+    if quantity.findtext("si:real/si:unit", "", PREFIXES) != RADIAN:
+        return value, expanded
+    degrees = math.degrees(float(quantity.findtext(VALUE, "", PREFIXES)))
+    if not expanded:
+        return shortened(f"{degrees:.17e}"), ""
+    u = math.degrees(float(expanded))
+    return tuple(rounded(x, decimals_of(u)) for x in (degrees, u))  # pyright: ignore[reportReturnType]
 
 
 def expanded_of(quantity: Element) -> tuple[str, str]:

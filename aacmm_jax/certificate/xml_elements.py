@@ -20,6 +20,7 @@ from ..uncertainty.coverage import LEVEL
 DCC, SI, XSI = "https://ptb.de/dcc", "https://ptb.de/si", "http://www.w3.org/2001/XMLSchema-instance"
 MILLIMETRE, RADIAN, ONE, CELSIUS = r"\milli\metre", r"\radian", r"\one", r"\degreecelsius"
 PREFIXES = {"dcc": DCC, "si": SI}
+LEFT_OUT_NAMES = " Sockets, observations or poses left out: "  # before their names in the statement on them
 _LARGEST = 1e100  # no quantity is as large in any unit
 
 Child = Element | str | None | Iterable[Any]  # whose items are children, too

@@ -38,6 +38,7 @@ def certificate(
     Certificate alone.
     """
     from ..certificate.printed import printed_certificate
+    from ..certificate.unstated import unstated
 
     suffix = output.suffix.lower()
     if suffix not in (".pdf", ".html"):
@@ -51,6 +52,13 @@ def certificate(
         with write_atomically(output) as temporary:
             temporary.write_bytes(content if isinstance(content, bytes) else content.encode())
     typer.echo(f"Written: {output}")
+    for sentence in unstated(dcc, administrative_data(about)):
+        typer.echo(sentence)
+
+
+def administrative_data(about: Path | None) -> files.AdministrativeData:
+    """The administrative data of a file; none is stated without one."""
+    return files.AdministrativeData() if about is None else files.read_administrative_data(about)
 
 
 def dcc_of(calibration: InputFile, record: Any, about: Path | None, evaluation: Path | None) -> str:
@@ -72,7 +80,7 @@ def dcc_of(calibration: InputFile, record: Any, about: Path | None, evaluation: 
         sources += [fingerprint(read), *tested.recording.sources]
     return dcc_xml(
         record,
-        files.AdministrativeData() if about is None else files.read_administrative_data(about),
+        administrative_data(about),
         created=made["created"],
         sources=list(dict.fromkeys(sources)),
         evaluation=tested,

@@ -18,6 +18,12 @@ from .toml import Strict, read_toml
 NOT_STATED = "not stated"
 NO_COUNTRY = "ZZ"  # reserved for users by ISO 3166-1: a certificate must have a country code, and none was given
 
+_LOOKED_FOR = {  # ISO/IEC 17025:2017, 7.8.2.1
+    "laboratory": ("name", "city"),
+    "customer": ("name", "city"),
+    "item": ("manufacturer", "model", "serial_number", "condition"),
+    "certificate": ("number", "received", "begin", "issued", "temperature_celsius"),
+}
 _LARGEST_LOGO, _MOST_PIXELS, _PNG = 1_000_000, 10_000_000, b"\x89PNG\r\n\x1a\n"  # bytes, pixels
 # All but the characters of XML 1.0, production 2.
 # What people call the decision rules; both editions of ISO 14253-1 where none is named.
@@ -174,6 +180,13 @@ class AdministrativeData(Strict):
     def country(self) -> str:
         """Country code of the certificate."""
         return self.certificate.country or self.laboratory.country or NO_COUNTRY
+
+    def not_stated(self) -> list[str]:
+        """Keys of what a reader looks for in a certificate, and what is not stated, such as ``item.manufacturer``."""
+        of = ((table, key, getattr(getattr(self, table), key)) for table, keys in _LOOKED_FOR.items() for key in keys)
+        keys = [f"{table}.{key}" for table, key, value in of if value in (None, NOT_STATED)]
+        keys += [] if "place" in self.certificate.model_fields_set else ["certificate.place"]
+        return keys + [name for name in ("person", "reference") if not getattr(self, name)]
 
 
 def read_administrative_data(path: str | os.PathLike) -> AdministrativeData:

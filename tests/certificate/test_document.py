@@ -38,6 +38,7 @@ from aacmm_jax.files.administrative_data import (
 from aacmm_jax.kinematics import corrections as kinds
 from aacmm_jax.kinematics.correction_kinds import Loads
 from aacmm_jax.summaries.calibration import calibration_summary
+from aacmm_jax.summaries.evaluation import evaluation_summary
 from tests.certificate import dcc_model
 from tests.certificate.conftest import CREATED, HOSTILE, KINDS
 from tests.refusals import assert_refused
@@ -297,6 +298,40 @@ def test_a_conformity_rests_on_results(record, full, evaluation):
     assert_refused(certificate(other, "pass"), "another calibration")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("before", "limit", "english", "german"),
+    [
+        ("nominal", 0.5, "; with the nominal parameters, the arm fails (Deltam)", "; mit den Nennparametern hält"),
+        ("as_found", 0.5, "; with the parameters as found, the arm fails (Deltam)", "; mit den Parametern bei Eingang"),
+        ("nominal", 50.0, "", ""),
+    ],
+)
+def test_conformity_is_of_the_calibrated_parameters(record, full, evaluation, before, limit, english, german):
+    """And where the arm fails with those before, this is stated as well."""
+    as_found = record.recording.nominal if before == "as_found" else None
+    record, evaluation = (x._replace(recording=x.recording._replace(as_found=as_found)) for x in (record, evaluation))
+    evaluation = evaluation._replace(limits={"Deltam": aj.acceptance.Limit(limit)})
+    worst = {stage: tests[0].metrics[0].value for stage, tests in evaluation.acceptance().items()}
+    assert (worst[before] > limit) == bool(english)
+    assert worst["calibrated"] < 0.1
+    stated = Conformity(verdict="pass", specification="S")
+    dcc = dcc_xml(record, full.model_copy(update={"conformity": stated}), created=CREATED, evaluation=evaluation)
+    assert dcc_model.faults(dcc) == []
+    (says,) = [x for x in contents(dcc, "*/dcc:statements") if x.startswith("The statement of conformity holds")]
+    assert says.endswith(english[2:].replace("with", "With") + ".") if english else says.endswith("parameters.")
+    for language, begins, fails in (("en", "conforms, with the c", english), ("de", "konform, mit den k", german)):
+        (text,) = [
+            value
+            for section in printed_certificate(dcc, language=language).pages.pages[1]
+            for key, value in section.facts
+            if key in ("Statement of conformity", "Konformitätsaussage")
+        ]
+        assert text.startswith(begins)
+        assert fails in text
+        assert (";" in text) == bool(fails)
+
+
 @pytest.mark.parametrize(
     ("stated", "used", "printed"),
     [
@@ -400,6 +435,21 @@ def test_held_out_poses_have_their_errors(record):
     assert values[*stated, "poses"].value == 5
     assert values[*stated, "RMS distance"].value == pytest.approx(np.sqrt(np.mean(rows.distance**2)), abs=5.1e-6)
     assert values[*stated, "largest distance"].value == pytest.approx(rows.distance.max(), abs=5.1e-6)
+
+
+@pytest.mark.slow
+def test_held_out_poses_of_an_evaluation_are_those_that_it_shows(evaluation, certificates):
+    held_out = evaluation_summary(evaluation)["held_out"]
+    poses, by_arm = held_out["predicted"]["poses"], held_out["calibrated"]
+    shown = {
+        "poses": poses["poses"],
+        "RMS distance": poses["rms_mm"],
+        "largest distance from the mean position": by_arm["distance_largest_mm"],
+        "RMS distance, predicted": poses["rms_predicted_mm"],
+    }
+    values = parse_dcc(certificates["all stated"])
+    stated = {key[2]: value.value for key, value in values.items() if key[1] == "Held-out poses"}
+    assert stated == pytest.approx(shown, abs=5.1e-7)
 
 
 @pytest.mark.slow
@@ -519,7 +569,7 @@ def test_what_is_stated_is_in_the_certificate(certificates, full):
     assert "first line\nsecond line" in contents(text, "*/dcc:statements")
     assert "a.h5, <b>.toml" in contents(text, "*/dcc:statements")
     equipment = "*/dcc:measurementResult[1]/dcc:measuringEquipments/dcc:measuringEquipment"
-    assert contents(text, f"{equipment}/dcc:name") == ["ball bar", "Reference lengths"]
+    assert contents(text, f"{equipment}/dcc:name") == ["ball bar", "Reference lengths", "Lengths of the test"]
     assert parse_dcc(text)["Calibrated parameters", "Scale", "k"].expanded
     temperature = root.find(f"*/{DCC}measurementResult/{DCC}influenceConditions//{SI}real")
     assert temperature is not None
@@ -560,8 +610,18 @@ def test_what_was_left_out_is_stated(record):
     assert said.startswith(
         "Left out: station T2, which contradicts the other data (F = 45.6 with 6 and 60 degrees of freedom"
     )
-    assert said.endswith("Sockets and observations left out: T2/day, T2/night.")
+    assert said.endswith("Sockets, observations or poses left out: T2/day, T2/night.")
     assert sum("they contradict the rest: station T2;" in one for one in contents(text, ".//dcc:usedMethods")) == 2
+    # What was done wrong with poses concerns sockets that remain.
+    poses = removed._replace(
+        kind="poses", group="A pose 1, A pose 7 (in B)", members=("A", "B", "A pose 1", "A pose 7")
+    )
+    text = dcc_xml(record._replace(removed=(poses, removed)), AdministrativeData(), created=CREATED)
+    assert any(one.endswith(" left out: A pose 1, A pose 7.") for one in contents(text, "*/dcc:statements"))
+    notes = printed_certificate(text, language="de").pages.pages[1][-1].notes
+    assert notes[0].startswith("Nicht verwendet, weil sie den übrigen Daten widersprechen: ")
+    assert {*notes[0].partition(": ")[2].partition(". ")[0].split(", ", 2)[:1]} <= {"A (Stellungen 1", "T2/day"}
+    assert all(says in notes[0] for says in ("A (Stellungen 1, 7)", "T2/day, T2/night"))
     hostile = record._replace(removed=(removed._replace(members=("A\x1b",)),))
     assert_refused(lambda: dcc_xml(hostile, AdministrativeData(), created=CREATED), r"A\x1b", "U+001B")
 
@@ -678,20 +738,31 @@ def printed(dcc: str, language: str = "en") -> dict[str, sections.Section]:
 
 @pytest.mark.slow
 def test_references_have_the_lengths_that_they_stand_for(record, evaluation):
-    """Of calibration and evaluation, in the DCC and printed; what no reference has remains by itself."""
+    """Of calibration and evaluation, in the DCC and printed, those of the test apart; what no reference has remains by
+    itself."""
     plate, bar = Reference(name="plate", serial_number="7", lengths=["A - B"]), Reference(name="bar", lengths=["D*"])
     about = AdministrativeData(reference=[plate, bar, Reference(name="sphere")])
     text = dcc_xml(record, about, created=CREATED, evaluation=evaluation)
     assert dcc_model.faults(text) == []
-    rows = [(row[0], row[-1].replace("\u00a0", " ")) for row in printed(text)["Traceability"].table]
+    rows, of_test = (
+        [(row[0], row[-1].replace("\u00a0", " ")) for row in printed(text)[title].table]
+        for title in ("Traceability", "Used for the test only")
+    )
     values = [part.recording.capture.lengths for part in (record, evaluation)]
     a_b, b_c, d_e = (f"{float(length.value):.7g}" for lengths in values for length in lengths)
     assert rows == [
         ("plate", f"A - B: {a_b} mm (u = 0.01 mm)"),
-        ("bar", f"D - E: test only: {d_e} mm (u = 0.001 mm)"),
         ("sphere", "–"),
         ("Reference lengths", f"B - C: {b_c} mm"),
     ]
+    assert of_test == [("bar", f"D - E: {d_e} mm (u = 0.001 mm)")]
+    both = AdministrativeData(reference=[Reference(name="plate", lengths=["A - B", "D - E"])])
+    text_of_both = dcc_xml(record, both, created=CREATED, evaluation=evaluation)
+    assert "test only: " in printed(text_of_both)["Traceability"].table[0][-1]
+    assert "Used for the test only" not in printed(text_of_both)
+    none = AdministrativeData(reference=[Reference(name="bar")])
+    (row,) = printed(dcc_xml(record, none, created=CREATED, evaluation=evaluation))["Used for the test only"].table
+    assert [x.replace("\u00a0", " ") for x in row] == ["Lengths of the test", f"D - E: {d_e} mm (u = 0.001 mm)"]
     assert printed(text)["Traceability"].headings[1:3] == ["Serial number", "Certified values, u (k = 1)"]
     everything = AdministrativeData(reference=[Reference(name="plate", lengths=["A - B", "B - C"])])
     assert "Reference lengths" not in contents(

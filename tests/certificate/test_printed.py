@@ -2,9 +2,11 @@
 
 import contextlib
 import io
+import math
 import re
 import unicodedata
 import zlib
+from decimal import Decimal
 from html.parser import HTMLParser
 from pathlib import Path
 from xml.etree import ElementTree
@@ -101,14 +103,22 @@ def test_the_dcc_comes_out_of_the_pdf_as_it_went_in(certificates, read):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ORDINARY)
 def test_every_printed_uncertainty_is_one_of_the_dcc(certificates, kind):
+    """Of angles, in degrees: to two digits of U."""
     page = printed_certificate(certificates[kind]).html()
     printed = re.findall(r"(−?[\d.]+) ± ([\d.]+)", page)
     assert len(printed) > 5
     stated = re.compile(
-        r"<si:value>([^<]*)</si:value>\s*<si:unit>[^<]*</si:unit>\s*<si:measurementUncertaintyUnivariate>\s*"
+        r"<si:value>([^<]*)</si:value>\s*<si:unit>([^<]*)</si:unit>\s*<si:measurementUncertaintyUnivariate>\s*"
         r"<si:expandedMU>\s*<si:valueExpandedMU>([^<]*)<"
     )
-    assert {(value.replace("−", "-"), u) for value, u in printed} <= set(stated.findall(certificates[kind]))
+    certified = set()
+    for value, unit, u in stated.findall(certificates[kind]):
+        if unit == r"\radian":
+            degrees = Decimal(f"{math.degrees(float(u)):.1e}")
+            u = f"{degrees:f}"
+            value = f"{Decimal(math.degrees(float(value))).quantize(degrees):f}"
+        certified.add((value, u))
+    assert {(value.replace("−", "-"), u) for value, u in printed} <= certified
 
 
 @pytest.mark.slow
@@ -124,7 +134,9 @@ def test_what_a_laboratory_states_is_printed(certificates):
     assert "20,25\u00a0°C\u00a0(u\u00a0=\u00a00,1\u00a0°C)" in texts
     assert {"b", "script"}.isdisjoint(Texts(page).tags)
     assert "Konformitätsaussage" in texts
-    assert "unentschieden (innerhalb der Grenze)" in texts
+    assert "unentschieden (innerhalb der Grenze), mit den kalibrierten Parametern" in "; ".join(texts)
+    assert any("mit u = 0,001\u00a0mm,\u00a01e−06\u00a0L für Aufnahme und Halterung" in text for text in texts)
+    assert any(text.endswith("Gefordert sind 30 verschiedene Orte (vorhanden: 1).") for text in texts)
 
 
 @pytest.mark.slow

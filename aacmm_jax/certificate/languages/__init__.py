@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-from pydantic import AfterValidator
+from pydantic import AfterValidator, Field
 
 from ...core.errors import InputError
 from ...files.administrative_data import NOT_STATED, Text
@@ -33,9 +33,10 @@ class _File(Strict):
     terms: dict[str, Text]
     kinds: dict[str, Text]
     metrics: dict[str, Text]
+    missing: dict[str, Text] = Field(default_factory=dict)
 
 
-_GROUPS = tuple(name for name in _File.model_fields if name not in ("code", "decimal"))
+_GROUPS = tuple(name for name in _File.model_fields if name not in ("code", "decimal", "missing"))
 # Of keys that other groups have as well.
 _SUFFIXED = {"sentences": "{}_sentence", "places": "place_{}", "kinds": "kind_{}", "metrics": "metric_{}"}
 
@@ -46,6 +47,7 @@ class Language(NamedTuple):
     code: str
     decimal: str
     texts: dict[str, str]
+    missing: tuple[tuple[re.Pattern[str], str], ...] = ()  # English sentences and what they are in this language
 
     def __call__(self, key: str, **values: str) -> str:
         """The text of a key, with values for the names in its braces."""
@@ -60,6 +62,22 @@ class Language(NamedTuple):
         """The text of a key with a number; "one | several" where they differ."""
         forms = self(key, number=number).split(" | ")
         return forms[0 if number == "1" else -1]
+
+    def translated(self, sentences: str) -> str:
+        """Sentences on what a procedure lacks; "" where this language does not have one of them."""
+        if self.code == "en":
+            return sentences
+        translated, end = [], 0
+        while end < len(sentences):
+            matches = [(match, text) for pattern, text in self.missing if (match := pattern.match(sentences, end))]
+            if not matches:
+                return ""
+            # Texts in braces may reach over several sentences: the shortest match is one.
+            match, text = min(matches, key=lambda found: found[0].end())
+            numbers = {name[1:]: self.number(value) for name, value in match.groupdict().items()}
+            translated.append(_NAMED.sub(lambda name, numbers=numbers: numbers[name[1]], text))
+            end = match.end()
+        return " ".join(translated).replace(" %", "\u00a0%")
 
     def stated(self, text: str) -> str:
         """A text, or that it is not stated, in this language."""
@@ -88,4 +106,15 @@ def language_of(named: str | os.PathLike) -> Language:
             if set(_NAMED.findall(given[key])) != set(_NAMED.findall(wanted[key])):
                 raise InputError(f"{path}: [{group}] {key!r} needs the same names in braces as {wanted[key]!r}.")
             texts[_SUFFIXED.get(group, "{}").format(key)] = given[key]
-    return Language(content.code, content.decimal, texts)
+    for key, text in content.missing.items():
+        if not set(_NAMED.findall(text)) <= set(_NAMED.findall(key)):
+            raise InputError(f"{path}: [missing] {text!r} has other names in braces than {key!r}.")
+    missing = ((re.compile(_pattern(key), flags=re.DOTALL), text) for key, text in content.missing.items())
+    return Language(content.code, content.decimal, texts, tuple(missing))
+
+
+def _pattern(sentence: str) -> str:
+    """A regular expression of a sentence with any texts in its braces."""
+    parts = _NAMED.split(sentence)
+    texts = [re.escape(part) if i % 2 == 0 else f"(?P<n{part}>.+?)" for i, part in enumerate(parts)]
+    return "".join(texts) + r"(?:\s|$)"
