@@ -216,7 +216,13 @@ def import_(
     if not check:
         show_summary(summary, as_json, views.capture)
         return
-    summary["check"] = checked_recording(recording.nominal, recording, manifest, written)
+    summary["check"] = checked = checked_recording(recording.nominal, recording, manifest, written)
+    if checked["angles"] and not (checked["found"] or checked["given"])["readings_outside_limits"]:
+        from ..diagnostics.findings import sentences
+        from ..diagnostics.recorded import outside_limits
+
+        explained = sentences(outside_limits(recording))
+        summary["warnings"] = [text for text in summary["warnings"] if text not in explained]
     show_summary(summary, as_json, lambda s: (*views.capture(s), "", *reading_check(s["check"])))
     if not summary["check"]["explained"]:
         raise typer.Exit(1)

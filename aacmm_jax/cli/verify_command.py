@@ -7,6 +7,7 @@ from typing import Any
 import typer
 
 from .. import files, plot, summaries
+from ..core.errors import InputError
 from ..files.inputs import fingerprint
 from ..files.outputs import together, write_atomically
 from ..summaries.tables import View
@@ -62,6 +63,9 @@ def verify(
     with together(output):
         recording = read_recording(capture)
         arm = None if delivered is None else files.load_specification(delivered, base=base, tip=tip)
+    named = None if arm is None or os.path.isfile(str(delivered)) else arm
+    if named is not None and named.arm.joints == recording.nominal.arm.joints:
+        _refuse_another_robot(recording.nominal, named)
     checked = with_spinner("Verifying", lambda: run(recording, arm))
     given, measured = arm or recording.as_found, recording.capture
     summary = summaries.verification.verification_summary(
@@ -71,6 +75,10 @@ def verify(
         scaled=bool(measured.lengths or measured.observations),
         max_rms=max_rms_mm,
     )
+    if named is not None and named.name != recording.nominal.name:
+        summary["warnings"].append(
+            f"The delivered arm '{named.name}' is not the arm '{summary['arm']}' of the recording; use the same robot."
+        )
     if output is not None:
         from ..report import write_verification
 
@@ -81,6 +89,18 @@ def verify(
     show_summary(summary, as_json, summaries.verification.verification)
     if not summary["achieved"]:
         raise typer.Exit(1)
+
+
+def _refuse_another_robot(nominal: Any, arm: Any) -> None:
+    """Refuse an arm given by its name whose parameters differ by more than a calibration changes, but for its probe;
+    a file with the parameters of one robot may describe nearly parallel axes by quite other numbers."""
+    for names, values in zip((("a", "d"), ("alpha",)), (nominal.length, nominal.angle), strict=True):
+        for name in names:
+            if float(abs(getattr(arm.arm, name) - getattr(nominal.arm, name)).max()) > values:
+                raise InputError(
+                    f"--delivered '{arm.name}' is another robot than '{nominal.name}', the arm of the recording: they "
+                    f"differ in {name}; name the delivered parameters of the same robot."
+                )
 
 
 @command(

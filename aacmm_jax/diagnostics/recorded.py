@@ -51,7 +51,7 @@ def of_recording(recording: Recording) -> list[Finding]:
     if simulated:
         return repeated
     exact = [f"{length.start} - {length.end}" for length in capture.lengths if float(length.u) == 0]
-    findings = [*_outside_limits(recording), *repeated]
+    findings = [*outside_limits(recording), *repeated]
     if exact:
         says = f"These lengths are treated as exact, because their u is 0: {shorten(exact)}."
         advice = "Give the standard uncertainty of each length."
@@ -59,7 +59,7 @@ def of_recording(recording: Recording) -> list[Finding]:
     return findings + _implausible_uncertainties(capture)
 
 
-def _outside_limits(recording: Recording) -> Iterator[Finding]:
+def outside_limits(recording: Recording) -> Iterator[Finding]:
     """Readings outside the joint limits: a wrong unit, or exchanged columns."""
     arm, q = recording.nominal.arm, np.asarray(recording.capture.readings)
     units = reading_units(arm.geometry)

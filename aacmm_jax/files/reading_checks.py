@@ -65,7 +65,7 @@ def angles_toml(
         entries |= {"unit": "deg" if explanation.angle < 1 else "rad"}
         entries.pop("counts_per_turn", None)
     if exchanged or as_read.columns:
-        entries["columns"] = reordered(as_read.columns)
+        entries["columns"] = reordered(as_read.columns) if exchanged else as_read.columns
     counts = as_read.counts_per_turn if explanation.angle == 1 else None
     size = ANGLE_UNITS[entries["unit"]] if counts is None else 2 * np.pi / np.broadcast_to(counts, joints)[order]
     # With the explanation's sign S and zero Z: S s (c - o) size + Z = S s (c - (o - Z / (S s size))) size.

@@ -167,6 +167,25 @@ def test_the_printed_table_passes_the_check(aacmm, tmp_path, few, header, size, 
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("zero", "warned"), [(101.0, False), (0.0, True)])
+def test_limits_that_the_proposed_zeros_keep_are_no_warning(aacmm, tmp_path, few, zero, warned):
+    """Columns stay as the manifest names them; readings that are outside and fit as they are keep the warning."""
+    arm = aj.load_arm("so100")
+    low, high = np.array(arm.limits).T
+    q = np.random.default_rng(2).uniform(low + 0.2, high - 0.2, (20, 5))
+    q[:4, 1] += 4.0 * warned  # rad, beyond the limits of joint 2
+    rows = np.hstack([np.degrees(q) - [0, zero, 0, 0, 0], np.asarray(arm.position(q))])
+    write(tmp_path / "p.csv", [*(f"J{i}" for i in range(1, 6)), "x_mm", "y_mm", "z_mm"], rows)
+    tables = 'angles = { unit = "deg", columns = "J*" }\n[[points]]\nfile = "p.csv"\ncolumns = { points = "*_mm" }\n'
+    (tmp_path / "m.toml").write_text(f'arm = "so100"\n{tables}')
+    found = json.loads(aacmm("import", "m.toml", "--check", "--json").stdout)
+    assert found["check"]["fits"] is warned
+    assert any("lie outside its limits" in text for text in found["warnings"]) is warned
+    if not warned:
+        assert tomllib.loads(found["check"]["angles"])["angles"]["columns"] == "J*"
+
+
+@pytest.mark.slow
 def test_readings_that_nothing_explains(aacmm, tmp_path, few):
     write(tmp_path / "poses.csv", [], np.random.default_rng(0).uniform(-3, 3, (30, 6)))
     said = aacmm("arm", "cheng2018-simulation", "--check", "poses.csv", expect=1)

@@ -55,6 +55,13 @@ def test_a_good_and_a_bad_delivery(aacmm, robot):
 
 
 @pytest.mark.slow
+def test_another_robot_is_refused_and_another_name_is_said(aacmm, robot):
+    assert "is another robot than 'nominal'" in aacmm("verify", "poses.toml", "--delivered", "ur10e", expect=2).stderr
+    found = json.loads(aacmm("verify", "poses.toml", "--delivered", "ur5e", "--json", expect=1).stdout)
+    assert "is not the arm 'nominal' of the recording" in found["warnings"][-1]
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("unit", "length", "warning"), [("deg", "100.0", "read as degrees"), ("rad", "1000.0", "The scale factor")]
 )
