@@ -122,8 +122,9 @@ def uncertainty_statement(record: CalibrationRecord) -> str:
         "effective degrees of freedom of the quantity, which are computed from the contributions to its variance. "
         "The standard uncertainties follow, by the law of propagation of uncertainty, from the noise of the "
         f"readings, {noise}, and from the {sources}. Each uncertainty is for one parameter alone; the covariance "
-        "matrix gives the correlations. Expanded uncertainties are rounded to two digits, and values to the same "
-        f"decimal place. Errors that the {model} does not describe are {unmodelled}."
+        "matrix gives the correlations. Expanded uncertainties are rounded to two digits (of angles in rad, to four, "
+        "since they are printed in degrees), and values to the same decimal place. Errors that the "
+        f"{model} does not describe are {unmodelled}."
     )
 
 

@@ -33,7 +33,9 @@ def parameters_result(record: CalibrationRecord, stage: str, uncertainty: Uncert
     names, quantities = parameter_names(arm), []
     for name, value in zip(names, np.asarray(Parameters(arm, names).vector()).tolist(), strict=True):
         note, u = _note_and_uncertainty(record, name) if calibrated else ("", None)
-        measured = real(value, in_d_si(parameter_unit(arm, name)), u, factors.get(name))
+        unit = in_d_si(parameter_unit(arm, name))
+        # Angles are printed in degrees: with two digits in rad, the two in degrees would be those of rounding.
+        measured = real(value, unit, u, factors.get(name), digits=4 if unit == RADIAN else 2)
         quantities.append(named("quantity", name, measured, says=note))
     corrections = (
         " Each joint correction adds its coefficient times a known function of the readings to theta (to d for a "

@@ -106,14 +106,20 @@ def decimals_of(uncertainty: float) -> int:
 
 
 def real(
-    value: float, unit: str, u: float | None = None, factor: float | None = None, decimals: int | None = None
+    value: float,
+    unit: str,
+    u: float | None = None,
+    factor: float | None = None,
+    decimals: int | None = None,
+    digits: int = 2,
 ) -> Element:
     """A value, perhaps with its uncertainty: the standard one ``u``, as it was given; or expanded by ``factor``, which
-    is stated with two digits, and the value rounded to them. ``decimals``: of a value without uncertainty.
+    is stated with two digits, or ``digits``, and the value rounded to them. ``decimals``: of a value without
+    uncertainty.
     """
     uncertainty = None
     if u is not None and factor is not None:
-        decimals = decimals_of(factor * u)
+        decimals = decimals_of(factor * u) + digits - 2
         uncertainty = si(
             "expandedMU",
             si("valueExpandedMU", rounded(factor * u, decimals)),

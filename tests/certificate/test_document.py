@@ -159,16 +159,16 @@ def test_elements_are_in_the_order_of_the_schema(certificates, kind):
     assert left == [found[0], *held_out, *found[1:], *later]
 
 
-def two_digits(found, value: float, expanded: float) -> None:
-    """U has two significant digits, and the value as many decimals."""
-    assert found.expanded == float(f"{expanded:.1e}")
-    step = 10.0 ** (int(f"{expanded:.1e}".partition("e")[2]) - 1)
+def two_digits(found, value: float, expanded: float, digits: int = 2) -> None:
+    """U has two significant digits (or so many), and the value as many decimals."""
+    step = 10.0 ** (int(f"{expanded:.1e}".partition("e")[2]) + 1 - digits)
+    assert found.expanded == pytest.approx(round(expanded / step) * step, rel=1e-12)
     assert found.value == pytest.approx(value, abs=0.5 * step * (1 + 1e-9))
     assert found.value / step == pytest.approx(round(found.value / step), abs=1e-6)
 
 
 def test_numbers_read_back(record):
-    """Values to two digits of their U; those that are exact, and certified ones, as they were given."""
+    """Values to two digits of their U, angles of parameters to four; exact and certified ones as they were given."""
     text = dcc_xml(record, AdministrativeData(), created=CREATED)
     values = parse_dcc(text)
     uncertainty = aj.uncertainty_of(record)
@@ -186,7 +186,8 @@ def test_numbers_read_back(record):
             assert found.unit == unit
             if stage == "Calibrated parameters" and name not in record.held:
                 i = record.names.index(name)
-                two_digits(found, number, factors[name] * math.sqrt(record.covariance[i, i]))
+                expanded = factors[name] * math.sqrt(record.covariance[i, i])
+                two_digits(found, number, expanded, digits=4 if unit == RAD else 2)
             else:
                 assert found == (number, unit, None)
         metrics = aj.evaluate(arm, record.recording.capture)
