@@ -14,7 +14,7 @@ and Raftery 1995, Journal of the American Statistical Association 90, section 4.
 """
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -154,6 +154,7 @@ def compare_models(
     mass: Numbers | None = None,
     centre: Numbers | None = None,
     gravity: Numbers = DOWN,
+    progress: Callable[[ComparedModel], object] | None = None,
 ) -> ComparedModels:
     """Fit models of the joints, each with its prior's scales learned, and predict regions that they have not seen.
 
@@ -177,6 +178,7 @@ def compare_models(
         mass: Mass of each link ``(n,)``, kg, as for `kinematics.with_corrections`.
         centre: Centre of mass of each link ``(n, 3)``, mm.
         gravity: Direction of gravity in the base frame ``(3,)``.
+        progress: Called with each model as soon as its errors are known.
 
     Returns:
         The errors of each model that the data can carry, and the recommended one with its calibration.
@@ -241,6 +243,9 @@ def compare_models(
             found.append(compared(model, of_model))
         except InputError as error:
             skipped[model] = str(error)
+        else:
+            if progress is not None:
+                progress(found[-1])
     if not found:
         raise InputError(skipped[named[0]])
     return ComparedModels(tuple(found), tuple(skipped))

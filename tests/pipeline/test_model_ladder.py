@@ -220,8 +220,9 @@ def test_the_bounds_of_a_file_are_those_of_its_models(paper_arm):
 
 @pytest.mark.slow
 def test_a_model_that_the_data_cannot_carry_is_skipped(paper_arm, space, bounds):
-    capture = sockets(paper_arm, space)
-    compared = compare_models(paper_arm, capture, bounds, models=["dh", "harmonics=1-31"])
+    capture, known = sockets(paper_arm, space), []
+    compared = compare_models(paper_arm, capture, bounds, models=["dh", "harmonics=1-31"], progress=known.append)
+    assert tuple(known) == compared.models
     assert ([model.model for model in compared.models], compared.skipped) == (["dh"], ("harmonics=1-31",))
     warnings = compared_models_summary(compared, "arm")["warnings"]
     assert "Not compared, because the data are too few for them: harmonics=1-31." in warnings
