@@ -56,7 +56,7 @@ def certificate(
         typer.echo(sentence)
 
 
-def administrative_data(about: Path | None) -> files.AdministrativeData:
+def administrative_data(about: Path | None) -> "files.AdministrativeData":
     """The administrative data of a file; none is stated without one."""
     return files.AdministrativeData() if about is None else files.read_administrative_data(about)
 

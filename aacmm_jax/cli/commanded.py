@@ -1,17 +1,18 @@
 """Commanded poses of ``correct``: the tip that they are of, their temperature, and the frame that they are in."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..core.errors import InputError
 from ..core.text import printable
-from ..data.recording import RecordedAs
 from ..files.inputs import InputFile
-from ..files.text_lines import Column
-from ..files.text_table import TextTable
 from .arm_command import first_frame
 from .options import numbers_option
+
+if TYPE_CHECKING:  # --help loads neither JAX nor readers of tables
+    from ..data.recording import RecordedAs
+    from ..files.text_lines import Column
 
 
 def targets_of(record: Any, chain: Any) -> dict[str, np.ndarray]:
@@ -130,7 +131,7 @@ def in_first_frame(record: Any, poses: np.ndarray) -> np.ndarray:
     return poses if urdf is None else np.linalg.inv(first_frame(record.recording.nominal)) @ poses
 
 
-def written_as(record: Any, unit: str | None) -> RecordedAs:
+def written_as(record: Any, unit: str | None) -> "RecordedAs":
     """How the readings of a calibration were recorded, for ``--as-recorded``. Raises `InputError` where it is not
     known."""
     if unit is not None:
@@ -144,7 +145,9 @@ def written_as(record: Any, unit: str | None) -> RecordedAs:
     return record.recording.recorded_as
 
 
-def columns_as_recorded(file: InputFile, written: RecordedAs) -> list[Column] | None:
+def columns_as_recorded(file: InputFile, written: "RecordedAs") -> "list[Column] | None":
     """The columns of the recording, where a table has columns of such names."""
+    from ..files.text_table import TextTable
+
     table = TextTable(file)
     return list(written.names) if table.header and table.has(written.names) else None

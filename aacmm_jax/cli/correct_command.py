@@ -11,7 +11,6 @@ from ..core.errors import InputError
 from ..core.units import ANGLE_UNITS
 from ..files.inputs import InputFile
 from ..files.outputs import together, write_text
-from ..kinematics.arm import by_joint
 from . import options
 from .app import command, show_summary, warn_of_unusable
 from .arm_command import first_frame
@@ -125,6 +124,7 @@ def correct(
     """
     from ..core.numpy_or_jax import to_numpy
     from ..files.table_columns import corrected_csv, corrected_poses_csv, read_poses
+    from ..kinematics.arm import by_joint
 
     begin = None if near is None else numbers_option("--near", near, "Q1,Q2,... with one reading per joint")
     picked, placed = (
