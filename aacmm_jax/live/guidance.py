@@ -19,19 +19,18 @@ from ..calibration.task import without_lengths
 from ..core.distributions import f_tail, student_quantile
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
-from ..data.capture import Capture
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
 from ..kinematics.priors import Prior, default_prior
 from ..model.observed import Observed
 from ..pipeline.single import calibrate, identify
 from ..planning.designs import Candidates
-from ..planning.kit_placement import rows_by_pose, rows_of_relations
+from ..planning.kit_placement import residual_vectors, rows_by_pose, rows_of_relations
 from ..planning.placement import LEAST_POSES
 from ..planning.problem import PRIOR, PlanOptions
 from ..uncertainty.coverage import LEVEL
 from ..uncertainty.linearisation import Linearisation
-from .candidates import Search
+from .candidates import Pool, Search
 from .limits import progress
 from .places import Setup, TakenPose, capture_of
 from .proposals import NextPose, Proposals
@@ -174,7 +173,12 @@ class Guide:
         linear = Linearisation.at(
             observed, Parameters(arm, problem.space.names), z, noise=problem.noise, least=_LEAST_U
         )
-        return _Solution.of(self.search, self._widths(), whole, linear, np.array(numbers), wrong)
+        session = whole.sessions[-1] if whole.sessions else ""
+        probe = f"probe of {session}" if len(whole.sessions) > 1 else ""
+        if self._start is not None:
+            self.search.follow(vector, arm, to_numpy(geometry), session, probe)
+        pool = self.search.pool(session, probe)
+        return _Solution.of(pool, self._widths(), linear, np.array(numbers), wrong)
 
     def _widths(self) -> Float[np.ndarray, " p"]:
         """Standard deviations of the prior in natural steps."""
@@ -248,13 +252,9 @@ class _Solution(NamedTuple):
 
     @classmethod
     def of(
-        cls, search: Search, widths: np.ndarray, capture: Capture, linear: Linearisation, numbers: np.ndarray,
-        wrong: frozenset[int],
-    ) -> "_Solution":  # fmt: skip
+        cls, pool: Pool, widths: np.ndarray, linear: Linearisation, numbers: np.ndarray, wrong: frozenset[int]
+    ) -> "_Solution":
         """Of rows at a solution."""
-        session = capture.sessions[-1] if capture.sessions else ""
-        later = len(capture.sessions) > 1
-        pool = search.pool(session, f"probe of {session}" if later else "")
         p, count = len(widths), pool.candidates.rows.shape[2]
         # Unknowns of the candidates first, then those of other sessions.
         index, size = np.arange(len(linear.z)), count
@@ -320,17 +320,15 @@ class _Solution(NamedTuple):
     def residuals(self) -> dict[int, PoseResidual]:
         """The residual of every pose, mm."""
         found, tips = {}, np.asarray(self.linear.point.forward.tip).T
-        sd = np.sqrt(self.squares / self.freedom)
+        sd, residual = np.sqrt(self.squares / self.freedom), residual_vectors(self.linear)
         for part in self.linear.parts():
             rows, (observation, by_tip) = len(part.values), (part.observation, np.asarray(part.by_tip))
-            position, moved = (np.asarray(observation.in_mm(np.asarray(x), by_tip)) for x in (part.values, by_tip))
             to_mm = np.moveaxis(np.linalg.inv(np.asarray(part.root)), 0, -1)
             to_mm = np.moveaxis(np.asarray(observation.in_mm(to_mm, by_tip)), -1, 0)
             sign = np.where(self.used[part.poses], -1.0, 1.0)[:, None, None]
             covariance = np.eye(rows) + sign * self.h[part.poses, :rows, :rows]
             u = sd * np.sqrt(np.maximum(np.einsum("mca,mab,mcb->m", to_mm, covariance, to_mm), 0.0))
-            residual = np.einsum("cxm,cm->mx", moved, position)
             for i, at in enumerate(range(part.poses.start, part.poses.stop)):
                 number = int(self.numbers[at])
-                found[number] = PoseResidual(tips[at], residual[i], float(u[i]), not bool(self.used[at]))
+                found[number] = PoseResidual(tips[at], residual[at], float(u[i]), not bool(self.used[at]))
         return found

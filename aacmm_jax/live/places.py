@@ -30,7 +30,7 @@ from ..planning.kit_placement import KitItem
 
 COLUMNS = {"torques": "torque_{}", "directions": "direction_{}", "load": "load_kg", "thermometer": "temperature_C"}
 _NEUTRAL = {"thermometer": 20.0}
-_FREE = ("points", "transforms", "pixels", "distances")
+FREE = ("points", "transforms", "pixels", "distances")
 _WANTED = 8  # poses in each place of which a plan says nothing
 
 
@@ -70,7 +70,7 @@ class Place(NamedTuple):
     @property
     def is_free(self) -> bool:
         """Whether the tip may be anywhere: an instrument sees it."""
-        return self.kind in _FREE
+        return self.kind in FREE
 
 
 class TakenPose(NamedTuple):

@@ -5,7 +5,7 @@ that can be simulated can be planned, and nothing here depends on a kind.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -155,19 +155,49 @@ def candidates_of_kit(
 ) -> Candidates:
     """The information that each pose of the observations would add, and that of certified values and reference lengths
     alone; unknowns are in the order of `Observed.of`."""
-    observed, space = Observed.of(Capture({}, lengths, observations), problem.arm), problem.space
-    vector, p = np.asarray(space.vector()), len(space.names)
+    return candidates_at(linearisation_of_kit(problem, observations, lengths), len(problem.space.names))
 
-    def linear_at(geometry: Float[AnyArray, " g"]) -> Linearisation:
+
+def candidates_at(linear: Linearisation, parameters: int) -> Candidates:
+    """The same of a linearisation, whose first unknowns are so many parameters."""
+    rows, owner = rows_by_pose(linear)
+    relations, _ = rows_of_relations(linear)
+    return Candidates(rows, owner, PRIOR * np.eye(len(linear.z)) + relations.T @ relations, parameters)
+
+
+def linearisation_of_kit(
+    problem: DesignProblem,
+    observations: Sequence[AbstractObservation],
+    lengths: Sequence[ReferenceLength] = (),
+    found: tuple[Float[np.ndarray, " p"], Mapping[str, Float[np.ndarray, "..."]]] | None = None,
+) -> Linearisation:
+    """Poses that were not taken yet, linearised with the nominal arm, or with ``found``: parameters, and the geometry
+    of what was measured already, by the names of `Observed.of`."""
+    observed, space = Observed.of(Capture({}, lengths, observations), problem.arm), problem.space
+
+    def at(vector: Float[np.ndarray, " p"], geometry: Float[AnyArray, " g"]) -> Linearisation:
         z = np.concatenate([vector, np.asarray(geometry)])
         return Linearisation.at(observed, space, z, noise=problem.noise, least=_LEAST_U)
 
-    linear = linear_at(observed.start(space, vector))
+    if found is not None:
+        vector, blocks = found
+        start = observed.split(np.asarray(observed.start(space, vector)))
+        return at(vector, np.concatenate([np.ravel(blocks.get(name, start[name])) for name in observed.blocks]))
+    vector = np.asarray(space.vector())
+    linear = at(vector, observed.start(space, vector))
     if max(np.abs(rows.values).max() for rows in linear.point.rows) > _START_AGREES:
-        linear = linear_at(fit_geometry(problem.arm, observed, {}, problem.noise).geometry)
-    rows, owner = rows_by_pose(linear)
-    relations, _ = rows_of_relations(linear)
-    return Candidates(rows, owner, PRIOR * np.eye(len(linear.z)) + relations.T @ relations, p)
+        linear = at(vector, fit_geometry(problem.arm, observed, {}, problem.noise).geometry)
+    return linear
+
+
+def residual_vectors(linear: Linearisation) -> Float[np.ndarray, "m 3"]:
+    """By which vector the tip of each pose is off, in the base frame, mm; 0 along what the pose does not measure."""
+    vectors = np.zeros((len(linear.observed.q), 3))
+    for part in linear.parts():
+        by_tip = np.asarray(part.by_tip)
+        values, moved = (np.asarray(part.observation.in_mm(np.asarray(x), by_tip)) for x in (part.values, by_tip))
+        vectors[part.poses] = np.einsum("cxm,cm->mx", moved, values)
+    return vectors
 
 
 def rows_by_pose(linear: Linearisation) -> tuple[Float[np.ndarray, "m r z"], Int[np.ndarray, " m"]]:
