@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..core.errors import InputError
-from ..core.numpy_or_jax import to_numpy
+from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..data.capture import Capture
 from ..data.capture_data import ReferenceLength
 from ..data.observations.observation import AbstractObservation
@@ -96,7 +96,7 @@ class Search:
         self.scaled = bool(measured)  # whether anything determines the scale; else that of the nominal arm is taken
         self._names = {place.name: i for i, place in enumerate(setup.places)}
         self._pools: dict[tuple[str, str], Pool] = {}
-        self._found: tuple[np.ndarray, Mapping[str, np.ndarray]] | None = None
+        self._found: tuple[np.ndarray, Mapping[str, AnyArray]] | None = None
         self._without_unseen(self._pool([drawn], "", "").candidates)
         every = np.full(len(setup.places), LEAST_POSES)
         stated, self.planned = self._stated(drawn)
@@ -122,7 +122,7 @@ class Search:
             self.unreached[""] = f"Nothing here measures {unseen}: U takes them as exact."
 
     def follow(
-        self, vector: Float[np.ndarray, " p"], arm: Arm, geometry: Mapping[str, np.ndarray], session: str, probe: str
+        self, vector: Float[np.ndarray, " p"], arm: Arm, geometry: Mapping[str, AnyArray], session: str, probe: str
     ) -> None:
         """Move the candidates to where things were found, and take their rows there, with the parameters and the arm
         found; the session and its probe as in `pool`. A candidate that cannot be there stays where it was stated."""

@@ -176,7 +176,7 @@ class Guide:
         session = whole.sessions[-1] if whole.sessions else ""
         probe = f"probe of {session}" if len(whole.sessions) > 1 else ""
         if self._start is not None:
-            self.search.follow(vector, arm, to_numpy(geometry), session, probe)
+            self.search.follow(vector, arm, geometry, session, probe)
         pool = self.search.pool(session, probe)
         return _Solution.of(pool, self._widths(), linear, np.array(numbers), wrong)
 
