@@ -169,7 +169,7 @@ def linearisation_of_kit(
     problem: DesignProblem,
     observations: Sequence[AbstractObservation],
     lengths: Sequence[ReferenceLength] = (),
-    found: tuple[Float[AnyArray, " p"], Mapping[str, AnyArray]] | None = None,
+    found: tuple[Float[np.ndarray, " p"], Mapping[str, AnyArray]] | None = None,
 ) -> Linearisation:
     """Poses that were not taken yet, linearised with the nominal arm, or with ``found``: parameters, and the geometry
     of what was measured already, by the names of `Observed.of`."""
