@@ -17,8 +17,6 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 CHOSEN = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS")
 _LIMITED = threading.Lock()  # the number is of the process: one call at a time sets it, and sets it back
-    threading.Lock()
-)  # the number of threads belongs to the process: one call at a time sets it, and sets it back
 
 
 @cache
