@@ -1,7 +1,6 @@
 """The Digital Calibration Certificate (DCC) of a calibration: XML after PTB's schema, version 3.3.0."""
 
 import datetime
-import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from xml.etree.ElementTree import Element
 
@@ -103,7 +102,7 @@ def dcc_xml(
         root.set(name, value)
     root.set("xsi:schemaLocation", f"{xml.DCC} {xml.DCC}/v{VERSION}/dcc.xsd")
     root.set("schemaVersion", VERSION)
-    number = administrative_data.certificate.number or str(uuid.uuid5(uuid.NAMESPACE_URL, xml.xml_text(root)))
+    number = administrative_data.certificate.number or xml.identifier_of(xml.xml_text(root))
     next(root.iter("dcc:uniqueIdentifier")).text = number
     return xml.xml_text(root)
 

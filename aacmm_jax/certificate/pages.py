@@ -15,7 +15,7 @@ from ..files.administrative_data import NOT_STATED
 from .languages import Language
 from .results_page import results_page
 from .sections import MOST_ROWS, Section, content, first, identification, more, with_u
-from .xml_elements import PREFIXES, root_of
+from .xml_elements import PREFIXES, root_of, states_number
 
 _BANNERS = {"Simulation": "simulated", "Not usable": "not_usable"}
 _RESERVATIONS = {"Not usable": "not_usable_sentence", "To be used with care": "with_care_sentence"}
@@ -43,6 +43,7 @@ def pages_of(dcc: str, words: Language) -> Pages:
     administrative = first(root, "dcc:administrativeData")
     core = first(administrative, "dcc:coreData")
     laboratory = first(administrative, "dcc:calibrationLaboratory")
+    number = core.findtext("dcc:uniqueIdentifier", "", PREFIXES)
     code = laboratory.findtext("dcc:calibrationLaboratoryCode", "", PREFIXES)
     statements = {}
     for statement in administrative.iterfind("dcc:statements/dcc:statement", PREFIXES):
@@ -60,7 +61,7 @@ def pages_of(dcc: str, words: Language) -> Pages:
             *([f"{words('accreditation')}: {code}"] if code else []),
         ],
         title=words("title"),
-        number=core.findtext("dcc:uniqueIdentifier", "", PREFIXES),
+        number=number if states_number(dcc, number) else words("number_not_stated"),
         banner=" ".join(words(key) for name, key in _BANNERS.items() if name in statements),
         pages=(
             list(_first_page(administrative, core, results, statements, words)),

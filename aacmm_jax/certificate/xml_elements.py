@@ -6,6 +6,7 @@ Elements and their order are those of the published schemas, https://ptb.de/dcc/
 https://ptb.de/si/v2.2.1/SI_Format.xsd.
 """
 
+import uuid
 from collections.abc import Iterable
 from importlib import metadata
 from typing import Any, NamedTuple
@@ -186,6 +187,18 @@ def xml_text(root: Element) -> str:
     # XML readers take a bare carriage return for a line feed.
     body = ElementTree.tostring(root, encoding="unicode").replace("\r", "&#13;")
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{body}\n'
+
+
+def identifier_of(text: str) -> str:
+    """The UUID of a certificate's text in which the unique identifier is empty: what identifies the certificate if no
+    number is stated."""
+    return str(uuid.uuid5(uuid.NAMESPACE_URL, text))
+
+
+def states_number(text: str, identifier: str) -> bool:
+    """Whether the unique identifier of a certificate is a number that the laboratory stated."""
+    tag = "dcc:uniqueIdentifier"
+    return identifier != identifier_of(text.replace(f"<{tag}>{identifier}</{tag}>", f"<{tag} />", 1))
 
 
 class CertifiedValue(NamedTuple):

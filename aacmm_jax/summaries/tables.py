@@ -285,13 +285,6 @@ def in_read_unit(unit: str, key: str, row: Mapping[str, Any]) -> "Cell":
     return number(None if value is None else people_read(unit)[0] * value)
 
 
-def rms_difference(row: Mapping[str, Any], best_rms: float) -> tuple[float, float]:
-    """The RMS error outside less that of the best model, and its standard error by the scatter of the differences
-    between regions, mm: a difference of squares is that of the roots times their sum."""
-    total = max(row["rms_outside"] + best_rms, 1e-300)
-    return row["difference"] / total, row["u_difference"] / total
-
-
 def lengths_sentence(row: Mapping[str, Any]) -> str:
     """What a calibration says of the lengths that it was tried on (`verdicts.checked_lengths`), in words."""
     low, high = (f"{row[key]:.4g}" for key in ("shortest_mm", "longest_mm"))

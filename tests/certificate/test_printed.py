@@ -16,7 +16,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.certificate import languages, printed_certificate, sections, xml_elements
 from tests.certificate import dcc_model
-from tests.certificate.conftest import KINDS
+from tests.certificate.conftest import CREATED, KINDS
 from tests.refusals import assert_refused
 
 SVG = b'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 2 1"><rect width="2" height="1"/></svg>'
@@ -79,12 +79,25 @@ def test_html_and_pdf_say_the_same_on_two_numbered_pages(certificates, read, kin
     html = Texts(printed_certificate(dcc, language=language, logo=SVG).html()).texts
     assert len(html) > 100
     assert [text for text in html if squeezed(text) not in squeezed("".join(pages))] == []
-    number = re.search("<dcc:uniqueIdentifier>(.*)</dcc:uniqueIdentifier>", dcc)
-    assert number is not None
+    identifier = re.search("<dcc:uniqueIdentifier>(.*)</dcc:uniqueIdentifier>", dcc)
+    assert identifier is not None
+    not_stated = {"en": "(number: not stated)", "de": "(Nummer: keine Angabe)"}[language]
+    number = "2026-1" if kind == "all stated" else not_stated
     page = {"en": "Page {} of 2", "de": "Seite {} von 2"}[language]
     for i, text in enumerate(pages, start=1):
-        assert number[1] in text
+        assert number in text
+        assert (identifier[1] in text) == (kind == "all stated")  # without a number, it is a UUID
         assert page.format(i) in text
+
+
+@pytest.mark.slow
+def test_a_stated_number_that_looks_like_a_uuid_is_printed(record, full):
+    number = "6ba7b810-9dad-51d1-80b4-00c04fd430c8"
+    certificate = full.certificate.model_copy(update={"number": number})
+    dcc = aj.certificate.dcc_xml(
+        record, full.model_copy(update={"certificate": certificate, "conformity": None}), created=CREATED
+    )
+    assert number in Texts(page(dcc, "en")).texts
 
 
 @pytest.mark.slow
