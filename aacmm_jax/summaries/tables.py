@@ -14,7 +14,7 @@ from functools import partial
 from numbers import Integral
 from typing import Any, NamedTuple
 
-from ..core.text import pluralise
+from ..core.text import MODEL_CHOSEN, pluralise
 from ..core.units import DEG, people_read, people_read_change
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 
@@ -169,6 +169,18 @@ def decimals_for(u: float | None, default: int = 4) -> int:
 def warnings_of(summary: Mapping[str, Any], lead: str = "Warning:", key: str = "warnings") -> list[Line]:
     """What a user should know before the numbers."""
     return [[Styled(lead, "yellow"), f" {warning}"] for warning in summary.get(key, ())]
+
+
+def decided_of(decisions: Iterable[str], cross_validated: bool) -> Iterator[str]:
+    """What was decided by default; and of the choice of a model, how its figures differ from a cross-validation."""
+    for decision in decisions:
+        yield f"Decided by default: {decision}"
+        if cross_validated and decision.startswith(MODEL_CHOSEN):
+            yield (
+                "These figures of held-out regions only compare models: a region is one group, or half of a joint's "
+                "travel, and a frame or target that other poses share is not fitted to it again. State the figure of "
+                "the table Cross-validation."
+            )
 
 
 def verdict_of(summary: Mapping[str, Any]) -> list[Line]:
