@@ -12,6 +12,7 @@ _BEGINS_FORMULA = ("=", "+", "-", "@", "\t")  # in the cell of a spreadsheet
 _LONGEST = 60  # characters of a text that a message quotes
 _LONGEST_NAME, _LONGEST_SENTENCE = 400, 1000
 _LARGE_F = 1000
+MODEL_CHOSEN = "Model of the joints"  # begins the sentence of the choice of a model
 _LONG_NAME = re.compile(rf"\S{{{_LONGEST_NAME + 1},}}")
 # Marks that are not seen, or change the direction of what follows, so that a text reads otherwise than it is.
 _MARKS = frozenset("\ufeff\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")

@@ -14,7 +14,7 @@ from ..calibration.record import CalibrationRecord, Removed
 from ..calibration.results import Calibration, Identification
 from ..core.distributions import f_tail
 from ..core.errors import InputError
-from ..core.text import shorten
+from ..core.text import MODEL_CHOSEN, shorten
 from ..core.units import DEG
 from ..data.capture import Capture, part_of
 from ..data.recording import Recording
@@ -259,11 +259,12 @@ def with_best_model(record: CalibrationRecord, solve: Solve, recorded: Record, o
     terms = [term_text(term) for term in found if term.kind in all_sought() or term.term.correction is not None]
     follow = f" Without it, residuals follow {shorten(terms, 3)}." if terms else ""
     gain = f"{100 * (1 - chosen.rms_outside / plain.rms_outside):.2g} % smaller than " if better else ""
+    difference, u = ladder.excess(_PLAIN, over=chosen.model)
     says = (
-        f"Model of the joints: {chosen.model}. It adds {chosen.parameters - plain.parameters} coefficients.{follow} In "
+        f"{MODEL_CHOSEN}: {chosen.model}. It adds {chosen.parameters - plain.parameters} coefficients.{follow} In "
         f"held-out regions its errors are {chosen.rms_outside:.3g} mm RMS, {gain}those of Denavit-Hartenberg "
         f"parameters alone, {plain.rms_outside:.3g} mm ({len(ladder.models)} models compared, {len(chosen.regions)} "
-        "regions)."
+        f"regions; difference {abs(difference):.2g} mm, standard error {u:.2g} mm)."
         + ("" if better else " As these hardly differ, the model that makes the measurements more probable was taken.")
     )
     corrected = chosen.result.space.base

@@ -24,9 +24,11 @@ from ..calibration.record import record_of
 from ..calibration.results import Calibration, PriorMetrics
 from ..core.arguments import checked_arguments, items_of
 from ..core.arrays import Numbers
+from ..core.blas_threads import one_blas_thread
 from ..core.distributions import student_quantile
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
+from ..core.text import listed
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.recording import Recording
@@ -84,6 +86,21 @@ class ComparedModel(NamedTuple):
         return float(np.mean([region.ratio for region in self.regions]))
 
 
+def paired_difference(model: ComparedModel, other: ComparedModel) -> tuple[float, float]:
+    """Mean over the regions of the differences of two models' mean square errors, and its standard error, mm^2."""
+    paired = model.mean_squares - other.mean_squares
+    return float(np.mean(paired)), float(np.std(paired, ddof=1) / np.sqrt(len(paired)))
+
+
+def rms_difference(difference: float, u: float, rms: float, other: float) -> tuple[float, float]:
+    """Difference of two RMS errors and its standard error, mm, by those of their squares, mm^2.
+
+    A difference of squares is that of the roots times their sum, which is taken as known.
+    """
+    total = max(rms + other, 1e-300)
+    return difference / total, u / total
+
+
 class ComparedModels(NamedTuple):
     """Models from simple to rich, and which of them to use.
 
@@ -91,6 +108,9 @@ class ComparedModels(NamedTuple):
         >>> compared = aj.compare_models(arm, two_bars, bounds, models=["dh", "harmonics=1"])
         >>> print(compared.best, compared.recommended.model)
         0 dh
+        >>> difference, u = compared.excess("harmonics=1", over="dh")
+        >>> print(f"{difference:.4f} mm, standard error {u:.4f} mm")
+        0.0003 mm, standard error 0.0003 mm
     """
 
     models: tuple[ComparedModel, ...]
@@ -104,21 +124,50 @@ class ComparedModels(NamedTuple):
     @property
     def differences(self) -> list[tuple[float, float]]:
         """Of each model from the best: mean difference of the mean square errors, and its standard error, mm^2."""
-        best = self.models[self.best].mean_squares
-        paired = [model.mean_squares - best for model in self.models]
-        return [(float(np.mean(part)), float(np.std(part, ddof=1) / np.sqrt(len(part)))) for part in paired]
+        return [paired_difference(model, self.models[self.best]) for model in self.models]
+
+    def excess(self, model: str, over: str | None = None) -> tuple[float, float]:
+        """How much larger the RMS error of one model outside is than that of another, and the standard error, mm.
+
+        The differences are paired: those of the mean square errors, region by region, as in the rule.
+
+        Args:
+            model: One of the compared models, by its name.
+            over: The model from which it differs; by default the best one.
+
+        Returns:
+            The difference, negative where the errors of ``model`` are smaller, and its standard error. The rule
+            excludes models that exceed the best by more than `significant` times the standard error.
+
+        Raises:
+            InputError: Such a model was not compared.
+        """
+        first = self._named(model)
+        second = self.models[self.best] if over is None else self._named(over)
+        return rms_difference(*paired_difference(first, second), first.rms_outside, second.rms_outside)
+
+    def _named(self, name: str) -> ComparedModel:
+        found = [model for model in self.models if model.model == name]
+        if not found:
+            names = listed([model.model for model in self.models])
+            raise InputError(f"'{name}' is not one of the compared models; name one of {names}.")
+        return found[0]
+
+    @property
+    def significant(self) -> float:
+        """Number of standard errors by which a model must exceed the best to be excluded (Student's t).
+
+        At 5 % for all models together (Bonferroni): the best is what chance favoured most.
+        """
+        level = _LEVEL / max(len(self.models) - 1, 1)
+        return float(student_quantile(1 - level / 2, len(self.models[0].regions) - 1))
 
     @property
     def as_good(self) -> tuple[ComparedModel, ...]:
-        """The best outside, and simpler ones that the regions cannot tell from it.
-
-        By Student's t of the differences, at 5 % for all together (Bonferroni): the best is what chance favoured most.
-        """
-        level = _LEVEL / max(len(self.models) - 1, 1)
-        factor = float(student_quantile(1 - level / 2, len(self.models[0].regions) - 1))
+        """The best outside, and simpler ones that the regions cannot tell from it."""
         simpler = slice(self.best + 1)
         differences = zip(self.models[simpler], self.differences[simpler], strict=True)
-        return tuple(model for model, (mean, u) in differences if mean <= factor * u)
+        return tuple(model for model, (mean, u) in differences if mean <= self.significant * u)
 
     @property
     def recommended(self) -> ComparedModel:
@@ -143,6 +192,7 @@ def default_models(arm: Arm, capture: Capture) -> tuple[str, ...]:
 
 
 @checked_arguments
+@one_blas_thread
 def compare_models(
     arm: Arm | ArmSpecification,
     capture: Capture,

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..core.text import listed as listed_words
-from ..pipeline.model_ladder import ComparedModels
+from ..pipeline.model_ladder import ComparedModels, rms_difference
 from .tables import (
     Cell,
     Columns,
@@ -15,7 +15,6 @@ from .tables import (
     attributes,
     listed,
     number,
-    rms_difference,
     warnings_of,
     written_of,
 )
@@ -43,6 +42,8 @@ def compared_models_summary(compared: ComparedModels, arm: str) -> dict[str, Any
         | {
             "difference": difference,
             "u_difference": u_difference,
+            "excess": excess,  # mm
+            "u_excess": u_excess,
             "converged": bool(model.result.converged),
             "regions": [
                 {"region": row.label, "poses": row.poses, "rms": math.sqrt(row.mean_square), "ratio": row.ratio}
@@ -50,10 +51,11 @@ def compared_models_summary(compared: ComparedModels, arm: str) -> dict[str, Any
             ],
         }
         for model, (difference, u_difference) in zip(compared.models, compared.differences, strict=True)
+        for excess, u_excess in [compared.excess(model.model)]
     ]
     finding = f"{chosen.model} is recommended: it predicts held-out regions best of all models compared."
     if chosen is not best:
-        difference, u = rms_difference(rows[compared.models.index(chosen)], best.rms_outside)
+        difference, u = compared.excess(chosen.model)
         finding = (
             f"{chosen.model} is recommended: its error on held-out regions is not significantly larger "
             f"than that of the best model ({best.model}): the difference is {difference:.2g} mm, with a standard "
@@ -93,8 +95,9 @@ def model_tables(summary: Mapping[str, Any]) -> tuple[Table, Table]:
 
     def to_best(row: Mapping[str, Any]) -> tuple[float | None, float | None]:
         """None for the best model itself, and where too few regions are compared."""
-        compared = row["difference"] is not None and row["u_difference"] is not None
-        return rms_difference(row, least) if compared and row["rms_outside"] > least else (None, None)
+        if row["difference"] is None or row["u_difference"] is None or row["rms_outside"] <= least:
+            return None, None
+        return rms_difference(row["difference"], row["u_difference"], row["rms_outside"], least)
 
     by_name = listed("Models", models, {
         "model": lambda row: (

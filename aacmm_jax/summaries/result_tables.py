@@ -20,6 +20,7 @@ BY_CONSTRUCTION = "fixed the scale"  # so that its error is zero
 MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}  # of decisions
 _SIGNS = {"conforms": "✓ conforms", "fails": "✗ fails", "undecided": "? undecided", None: "–"}
 _HARMONIC = re.compile(r"(?:cos|sin)(\d+)_(\d+)")  # order, joint
+_REFITTED = "geometry (frame, target, ...) fitted to it again [mm]"
 _MOST_LISTED = 48  # coefficients of harmonics that a table lists one by one
 
 
@@ -75,9 +76,9 @@ def validation_tables(summary: Row) -> list[Table]:
         ("RMS error of reference lengths", "length_error_rms_mm", "length_u_mm"),
     ]
     cells = [(title, summary[value], summary[u]) for title, value, u in pooled if summary[value] is not None]
-    caption = f"Cross-validation: each of {summary['groups']} groups held out once [mm]"
+    caption = f"Cross-validation: each of {summary['groups']} groups held out once, with its {_REFITTED}"
     if summary["groups"] == 1:
-        caption = "The group held out, with its geometry (frame, target, ...) fitted to it again [mm]"
+        caption = f"The group held out, with its {_REFITTED}"
     shown = [listed(caption, cells, ("", "residual", "predicted by u"))]
     rows = summary.get("left_out") or []
     if rows:

@@ -14,7 +14,7 @@ from functools import partial
 from numbers import Integral
 from typing import Any, NamedTuple
 
-from ..core.text import pluralise
+from ..core.text import MODEL_CHOSEN, pluralise
 from ..core.units import DEG, people_read, people_read_change
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 
@@ -171,6 +171,18 @@ def warnings_of(summary: Mapping[str, Any], lead: str = "Warning:", key: str = "
     return [[Styled(lead, "yellow"), f" {warning}"] for warning in summary.get(key, ())]
 
 
+def decided_of(decisions: Iterable[str], cross_validated: bool) -> Iterator[str]:
+    """What was decided by default; and of the choice of a model, how its figures differ from a cross-validation."""
+    for decision in decisions:
+        yield f"Decided by default: {decision}"
+        if cross_validated and decision.startswith(MODEL_CHOSEN):
+            yield (
+                "These figures of held-out regions only compare models: a region is one group, or half of a joint's "
+                "travel, and a frame or target that other poses share is not fitted to it again. State the figure of "
+                "the table Cross-validation."
+            )
+
+
 def verdict_of(summary: Mapping[str, Any]) -> list[Line]:
     """What a result is good for, in one line."""
     verdict = summary.get("verdict")
@@ -271,13 +283,6 @@ def in_read_unit(unit: str, key: str, row: Mapping[str, Any]) -> "Cell":
     """A value of a row in the unit in which people read it; nothing where the row has none."""
     value = row.get(key)
     return number(None if value is None else people_read(unit)[0] * value)
-
-
-def rms_difference(row: Mapping[str, Any], best_rms: float) -> tuple[float, float]:
-    """The RMS error outside less that of the best model, and its standard error by the scatter of the differences
-    between regions, mm: a difference of squares is that of the roots times their sum."""
-    total = max(row["rms_outside"] + best_rms, 1e-300)
-    return row["difference"] / total, row["u_difference"] / total
 
 
 def lengths_sentence(row: Mapping[str, Any]) -> str:

@@ -394,6 +394,7 @@ def test_cross_validation_is_printed_group_by_group(aacmm, folder):
     assert all(0.5 < row["rms_mm"] / row["rms_predicted_mm"] < 1.7 for row in rows)
     shown = " ".join(aacmm("calibrate", folder / "tracker.h5", "-o", "c.h5", "--cross-validate").stdout.split())
     assert "group held out poses RMS distance predicted" in shown
+    assert "held out once, with its geometry (frame, target, ...) fitted to it again [mm]" in shown
     found = json.loads(aacmm("show", "c.h5", "--json").stdout)["cross_validation"]
     assert {row["group"]: row["poses"] for row in found["left_out"]} == {"tracker": 60, "ball": 25}
     assert all(0.5 < row["rms_mm"] / row["rms_predicted_mm"] < 1.7 for row in found["left_out"])

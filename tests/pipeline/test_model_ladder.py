@@ -25,7 +25,7 @@ from aacmm_jax.pipeline.model_ladder import (
     log_evidence,
 )
 from aacmm_jax.pipeline.single import with_joint_model
-from aacmm_jax.summaries.compared_models import compared_models_summary
+from aacmm_jax.summaries.compared_models import compared_models_summary, model_tables
 
 NOISE = aj.Noise(encoder_arcsec=10, seating=0.02)
 FRAME = (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0)
@@ -168,12 +168,35 @@ def test_placements_are_the_regions_where_there_are_several(paper_arm, space):
     ],
 )
 def test_regions_exclude_and_evidence_decides_among_the_others(squares, evidence, expected):
-    def model(name, values, log_evidence):
-        regions = tuple(UnseenRegion(str(i), 10, value, 1.0) for i, value in enumerate(values))
-        return ComparedModel(name, 1, 1.0, 0.1, regions, 0.0, None, log_evidence)
+    assert comparison(squares, evidence).recommended.model == expected
 
-    models = tuple(model(*of) for of in zip("abc", squares, evidence, strict=True))
-    assert ComparedModels(models).recommended.model == expected
+
+def comparison(squares, evidence):
+    """Models a, b, ... by their mean square errors in each region."""
+    result = SimpleNamespace(converged=True)
+    models = []
+    for name, values, probable in zip("abc", squares, evidence, strict=False):
+        regions = tuple(UnseenRegion(str(i), 10, value, 1.0) for i, value in enumerate(values))
+        models.append(ComparedModel(name, 1, 1.0, 0.1, regions, 0.0, result, probable))
+    return ComparedModels(tuple(models))
+
+
+def test_the_difference_of_two_models_is_paired():
+    """By hand: mean squares 6 and 4 mm^2, so 2.4495 and 2 mm; their differences 1, 2 and 3 mm^2 have a standard error
+    of 1 / sqrt(3), though either scatters twice as much or as much as they do."""
+    compared = comparison([[4.0, 6.0, 8.0], [3.0, 4.0, 5.0]], (0.0, 0.0))
+    expected = (0.44949, 0.57735 / 4.44949)
+    assert compared.excess("a") == pytest.approx(expected, rel=1e-5)
+    assert compared.excess("b", over="a") == pytest.approx((-expected[0], expected[1]), rel=1e-5)
+    assert compared.excess("b") == (0.0, 0.0)
+    assert compared.significant == pytest.approx(4.303, abs=1e-3)  # Student's t of 2 degrees of freedom
+    with pytest.raises(aj.InputError, match="'c' is not one of the compared models; name one of a and b"):
+        compared.excess("a", over="c")
+    rows = compared_models_summary(compared, "arm")["models"]
+    assert [(row["excess"], row["u_excess"]) for row in rows] == [compared.excess("a"), (0.0, 0.0)]
+    shown = model_tables({"models": rows, "regions": []})[0]
+    columns = [shown.headings.index(heading) for heading in ("excess [mm]", "u of excess")]
+    assert [shown.cells[0][column].value for column in columns] == pytest.approx(list(expected), rel=1e-5)
 
 
 @pytest.mark.first_rows(1)
@@ -204,6 +227,9 @@ def test_a_model_that_predicts_worse_is_not_taken_by_default(monkeypatch, paper_
     assert (chosen is not record) == taken
     assert any("Model of the joints: gravity" in says for says in chosen.decisions) == taken
     assert any("2 % smaller" in says for says in chosen.decisions) == (outside < 0.985)
+    # The squares differ by 1 - outside^2, the roots by 1 - outside; half a unit of scatter over three regions is 0.29.
+    says = f"difference {abs(1 - outside):.2g} mm, standard error {0.5 / 3**0.5 / (1 + outside):.2g} mm)"
+    assert any(says in sentence for sentence in chosen.decisions) == taken
 
 
 @pytest.mark.slow

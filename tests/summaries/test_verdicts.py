@@ -4,7 +4,7 @@ import pytest
 
 from aacmm_jax.diagnostics import Finding
 from aacmm_jax.diagnostics.held_out import IN_TURN
-from aacmm_jax.summaries.tables import decimals_for, lengths_sentence, rms_difference, two_digits
+from aacmm_jax.summaries.tables import decimals_for, lengths_sentence, two_digits
 from aacmm_jax.summaries.verdicts import (
     calibration_verdict,
     checked_lengths,
@@ -242,9 +242,3 @@ def test_checked_lengths(lengths, held_out, says):
 
 def test_no_lengths_are_tested_without_any():
     assert checked_lengths([], None, False) is None
-
-
-def test_difference_of_rms_errors():
-    """0.5 mm and 0.3 mm differ by 0.2 mm, as 0.25 and 0.09 mm^2 do by 0.16."""
-    row = {"rms_outside": 0.5, "difference": 0.16, "u_difference": 0.08}
-    assert rms_difference(row, 0.3) == pytest.approx((0.2, 0.1))
