@@ -12,6 +12,7 @@ from xml.etree.ElementTree import Element
 
 from ..core.errors import InputError
 from ..files.administrative_data import NOT_STATED
+from .conformity import conformity
 from .languages import Language
 from .results_page import results_page
 from .sections import MOST_ROWS, Section, content, first, identification, more, with_u
@@ -104,6 +105,7 @@ def _first_page(
         "issued": core.findtext("dcc:issueDate", "", PREFIXES),
     }
     yield Section(words("identification"), [(words(key), value) for key, value in facts.items() if value])
+    yield conformity(results, statements, words)
     described = content(after.find("dcc:usedMethods/dcc:usedMethod", PREFIXES), "dcc:description")
     counts = [(name.lower(), number) for name, number in re.findall(r"(\w[\w ]*): (\d+)(?=[;.])", described)]
     counted = ", ".join(words.counted(name, number) for name, number in counts if number != "0")

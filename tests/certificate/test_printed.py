@@ -101,6 +101,15 @@ def test_a_stated_number_that_looks_like_a_uuid_is_printed(record, full):
 
 
 @pytest.mark.slow
+def test_limits_without_a_statement_are_none(record, full, evaluation):
+    about = full.model_copy(update={"conformity": None})
+    dcc = aj.certificate.dcc_xml(record, about, created=CREATED, evaluation=evaluation)
+    (_, conformity, *_), _ = printed_certificate(dcc).pages.pages
+    assert [key for key, _ in conformity.facts] == ["Decision rule", "Limits of the evaluation"]
+    assert conformity.paragraphs == ["No statement of conformity is made."]
+
+
+@pytest.mark.slow
 def test_the_dcc_comes_out_of_the_pdf_as_it_went_in(certificates, read):
     """It is valid, and the PDF says that it is PDF/A-3, which may hold it."""
     dcc = certificates["all stated"]
