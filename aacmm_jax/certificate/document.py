@@ -136,7 +136,7 @@ def _decided_arms(tests: Tests) -> str:
     stage, before = ("as_found", "parameters as found") if "as_found" in tests else ("nominal", "nominal parameters")
     metrics = [metric.name for test in tests[stage] for metric in test.metrics if metric.decision == "fails"]
     fails = f" With the {before}, the arm fails ({', '.join(metrics)})." if metrics else ""
-    return f"The statement of conformity holds for the arm with the calibrated parameters.{fails}"
+    return f"The statement of conformity holds for the arm with the calibrated parameters loaded into it.{fails}"
 
 
 def _administrative(

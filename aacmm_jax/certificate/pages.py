@@ -12,6 +12,7 @@ from xml.etree.ElementTree import Element
 
 from ..core.errors import InputError
 from ..files.administrative_data import NOT_STATED
+from .conformity import conformity
 from .languages import Language
 from .results_page import results_page
 from .sections import MOST_ROWS, Section, content, first, identification, more, with_u
@@ -88,7 +89,7 @@ def _first_page(
     administrative: Element, core: Element, results: dict[str, Element], statements: dict, words: Language
 ) -> Iterator[Section]:
     item, after = first(administrative, "dcc:items/dcc:item"), results["Calibrated parameters"]
-    days = [core.findtext(f"dcc:{key}PerformanceDate", "", PREFIXES) for key in ("begin", "end")]
+    days = [words.date(core.findtext(f"dcc:{key}PerformanceDate", "", PREFIXES)) for key in ("begin", "end")]
     facts = {
         "object": content(item, "dcc:name"),
         "manufacturer": words.stated(content(item, "dcc:manufacturer/dcc:name")),
@@ -98,12 +99,13 @@ def _first_page(
         "condition": content(item, "dcc:description"),
         "customer": "; ".join(_address(first(administrative, "dcc:customer"), words)),
         "replaces": core.findtext("dcc:reportAmendedSubstituted/dcc:replacedUniqueIdentifier", "", PREFIXES),
-        "received": core.findtext("dcc:receiptDate", "", PREFIXES),
+        "received": words.date(core.findtext("dcc:receiptDate", "", PREFIXES)),
         "calibrated": " – ".join(dict.fromkeys(days)),
         "place": words("place_" + core.findtext("dcc:performanceLocation", "other", PREFIXES)),
-        "issued": core.findtext("dcc:issueDate", "", PREFIXES),
+        "issued": words.date(core.findtext("dcc:issueDate", "", PREFIXES)),
     }
     yield Section(words("identification"), [(words(key), value) for key, value in facts.items() if value])
+    yield conformity(results, statements, words)
     described = content(after.find("dcc:usedMethods/dcc:usedMethod", PREFIXES), "dcc:description")
     counts = [(name.lower(), number) for name, number in re.findall(r"(\w[\w ]*): (\d+)(?=[;.])", described)]
     counted = ", ".join(words.counted(name, number) for name, number in counts if number != "0")

@@ -6,11 +6,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 from xml.etree.ElementTree import Element
 
-from ..acceptance.judgement import RULES
+from .conformity import STAGES, limit_of, stage_before, tests_of
 from .languages import Language
 from .sections import (
     MOST_ROWS,
-    VALUE,
     Section,
     content,
     expanded_of,
@@ -28,65 +27,28 @@ from .xml_elements import LEFT_OUT_NAMES, PREFIXES
 _MOST_FINDINGS, _MOST_JOINTS = 4, 8  # the certificate has two pages
 _MOST_CHARACTERS, _MOST_MISSING = 280, 130  # of a finding, and of what a procedure lacks
 _COLUMNS = ("alpha", "a", "d", "theta", "beta")
-_STAGES = {"nominal": "nominal parameters", "as_found": "parameters as found", "after": "calibrated parameters"}
 # Of verdicts, the worst first.
 _VERDICTS = ("fail", "conditionalFail", "conditionalPass", "pass")
 
 
 def results_page(results: dict[str, Element], statements: dict, words: Language) -> Iterator[Section]:
     """The parts of the page, of measurement results and statements by their names."""
-    before = "as_found" if "Parameters as found" in results else "nominal"
+    before = stage_before(results)
     stages = [named_in(results[f"{stage[0].upper()}{stage[1:]}"], "dcc:results/dcc:result")
-              for stage in (_STAGES[before], _STAGES["after"])]  # fmt: skip
+              for stage in (STAGES[before], STAGES["after"])]  # fmt: skip
     for section in (_repeatability, _lengths, _observations):
         yield from section(stages, before, words)
     yield from _held_out(stages[1], words)
     yield from _volume(stages[1], words)
     yield from _parameters(stages[1], words("parameters"), words)
     yield from _parameters(stages[0], words("parameters_before", before=words(before)), words)
-    both = [results.get(f"Acceptance tests, {_STAGES[stage]}") for stage in (before, "after")]
-    tests, u_test = [named_in(stage, "dcc:results/dcc:result") for stage in both], _u_test(both[1], words)
+    tests = [tests_of(results, stage) for stage in (before, "after")]
+    u_test = _u_test(results.get(f"Acceptance tests, {STAGES['after']}"), words)
     called = dict.fromkeys(name.partition(": ")[0] for name in tests[1])
     for standard in called:
         yield _tests(standard, tests[0], tests[1], before, u_test, words)
         u_test = ""  # said once
-    norms = {
-        norm.text: None for test in tests[1].values() for norm in test.iterfind(".//dcc:metaData/dcc:norm", PREFIXES)
-    }
-    rule, facts = "; ".join(text for text in RULES.values() if text in norms), []
-    for stated in statements.get("Conformity", ()):
-        rule = content(stated, "dcc:declaration")
-        facts = [
-            (words("specification"), stated.findtext("dcc:norm", "", PREFIXES)),
-            (words("verdict"), _verdict(stated, tests[0].values(), before, words)),
-        ]
-    for key, text in RULES.items():
-        rule = rule.replace(text, words(key))
-    if rule:
-        facts[1:1] = [(words("decision_rule"), rule), (words("limits"), _limits(tests[1].values(), words))]
-    yield Section(words("conformity"), facts, [] if facts else [words("no_conformity_sentence")])
     yield from _findings(statements, words)
-
-
-def _verdict(stated: Element, earlier: Iterable[Element], before: str, words: Language) -> str:
-    """The verdict, that it is of the calibrated parameters, and whether the arm fails with those before."""
-    verdict = words("verdict_sentence", verdict=words(stated.findtext("dcc:conformity", "", PREFIXES)))
-    metrics = (part for test in earlier for part in named_in(test, "dcc:data/dcc:list").items())
-    fails = [symbol for symbol, metric in metrics
-             if any(_limit(x)[1] == "fail" for x in metric.iterfind("dcc:quantity", PREFIXES))]  # fmt: skip
-    return "; ".join([verdict, *([words(f"fails_{before}_sentence", metrics=", ".join(fails))] if fails else [])])
-
-
-def _limits(tests: Iterable[Element], words: Language) -> str:
-    """The limits by which values were decided; from the least to the largest where they grow with a length."""
-    limits = {}
-    for test in tests:
-        for symbol, metric in named_in(test, "dcc:data/dcc:list").items():
-            numbers = {limit for x in metric.iterfind("dcc:quantity", PREFIXES) if (limit := _limit(x)[0])}
-            limits.setdefault(symbol, set()).update(numbers)
-    ends = {key: dict.fromkeys(shortened(f(x, key=float)) for f in (min, max)) for key, x in limits.items() if x}
-    stated = (f"{symbol} {words.number(' – '.join(both))} mm" for symbol, both in ends.items())
-    return "; ".join(text.replace(" ", "\u00a0") for text in stated)
 
 
 def _findings(statements: dict, words: Language) -> Iterator[Section]:
@@ -258,7 +220,7 @@ def _tests(
             was = _worst(first[symbol].findall("dcc:quantity", PREFIXES)) if symbol in first else None
             expanded, factor = expanded_of(worst)
             factors |= {factor: None} if factor else {}
-            limit, verdict = _limit(worst)
+            limit, verdict = limit_of(worst)
             numbers = [
                 number_of(was, words),
                 number_of(worst, words),
@@ -289,20 +251,11 @@ def _u_test(tests: Element | None, words: Language) -> str:
     return ", ".join(f"{x} {unit}" for x, unit in zip(numbers, ("mm", "L"), strict=False)).replace(" ", "\u00a0")
 
 
-def _limit(quantity: Element) -> tuple[str, str]:
-    """Limit and verdict of a value, "" where there is none."""
-    stated = quantity.find("dcc:measurementMetaData/dcc:metaData", PREFIXES)
-    if stated is None:
-        return "", ""
-    limit = stated.findtext(f"dcc:data/dcc:quantity/{VALUE}", "", PREFIXES)
-    return limit, stated.findtext("dcc:conformity", "", PREFIXES)
-
-
 def _worst(quantities: Iterable[Element]) -> Element:
     """The value with the worst verdict and, of several, farthest beyond its limit; the largest without limits."""
 
     def badness(quantity: Element) -> tuple[Any, ...]:
-        limit, verdict = _limit(quantity)
+        limit, verdict = limit_of(quantity)
         size = abs(float(value_of(quantity)))
         return (-_VERDICTS.index(verdict), size - float(limit)) if verdict in _VERDICTS and limit else (-9, size)
 

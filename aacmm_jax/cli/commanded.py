@@ -139,8 +139,8 @@ def written_as(record: Any, unit: str | None) -> "RecordedAs":
     if record.recording.recorded_as is None:
         raise InputError(
             "--as-recorded needs to know how the readings were recorded, but the calibration does not contain it, as "
-            "those of simulations, robots of several chains, several captures or corrected readings; calibrate from "
-            "one manifest, or give joint values without --as-recorded."
+            "those of simulations, robots of several chains or several captures; calibrate from one manifest, or give "
+            "joint values without --as-recorded."
         )
     return record.recording.recorded_as
 

@@ -1,6 +1,7 @@
 """What an arm file (TOML) may hold, a commented template of one, and what ``--model`` and ``--prior`` say of an arm."""
 
 import math
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -196,6 +197,21 @@ class ArmFile(Strict):
     corrections: CorrectionsTable | None = None
     noise: NoiseTable | None = None
     priors: PriorTable | None = None
+
+    @classmethod
+    def other_kind(cls, content: Mapping[str, Any], path: str | os.PathLike) -> str | None:
+        """A manifest, which names the arm."""
+        if "joint" in content or "urdf" in content:
+            return None
+        if "arm" in content:
+            arm = f"arm = '{content['arm']}'" if isinstance(content["arm"], str) else "arm"
+            return (
+                f"is a manifest, not an arm file; give the arm that it names ({arm}), or read the manifest with aacmm "
+                "import or aj.files.read_manifest."
+            )
+        if isinstance(content.get("points"), Mapping):
+            return "is a manifest of points, not an arm file; give an arm file, or read it with aj.files.read_points."
+        return None
 
     @property
     def units(self) -> dict[str, float]:

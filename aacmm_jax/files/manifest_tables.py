@@ -2,6 +2,9 @@
 
 import datetime
 import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -291,6 +294,21 @@ class _Poses(Recorded):
     camera: list[CameraTable] = Field(default_factory=list)
     target: list[TargetTable] = Field(default_factory=list)
     pixels: list[PixelsTable] = Field(default_factory=list)
+
+    @classmethod
+    def other_kind(cls, content: Mapping[str, Any], path: str | os.PathLike) -> str | None:
+        """The file of an arm, or a manifest of points."""
+        if "arm" in content:
+            return None
+        if "joint" in content or "urdf" in content:
+            name = Path(path).name
+            return (
+                "is an arm file, not a manifest: it lacks the key arm and tables of data such as [[socket]] or "
+                f"[[points]]; give a manifest with arm = '{name}', or read the arm with aacmm arm or aj.load_arm."
+            )
+        if isinstance(content.get("points"), Mapping):
+            return "is a manifest of points, without an arm; read it with aj.files.read_points."
+        return None
 
 
 _FIELDS: dict[str, Any] = {

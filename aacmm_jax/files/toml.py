@@ -32,6 +32,12 @@ class Strict(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, strict=True, allow_inf_nan=False)
 
+    @classmethod
+    def other_kind(cls, content: Mapping[str, Any], path: str | os.PathLike) -> str | None:
+        """What a file of another kind is, and what reads it, as the rest of a sentence on the file; None where it may
+        be of this kind."""
+        return None
+
     @field_validator("*", mode="before")
     @classmethod
     def _no_booleans(cls, value: Any, info: Any) -> Any:
@@ -64,6 +70,9 @@ def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
     except ValueError as error:  # digits beyond those that Python converts
         raise InputError(f"{path} contains a number with thousands of digits; correct the number.") from error
     _check_content(path, content)
+    other = model.other_kind(content, path) if issubclass(model, Strict) else None
+    if other is not None:
+        raise InputError(f"{path} {other}")
     return validated(model, content, str(path))
 
 

@@ -12,6 +12,7 @@ from ..calibration.record import CalibrationRecord, record_of
 from ..calibration.results import Calibration, Identification
 from ..calibration.sampling import monte_carlo
 from ..core.arguments import checked_arguments, with_options
+from ..core.blas_threads import one_blas_thread
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..data.capture import join_sessions
 from ..data.noise import Noise
@@ -75,6 +76,7 @@ class CaptureOptions(NamedTuple):
 
 @checked_arguments
 @with_options(CaptureOptions)
+@one_blas_thread
 def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord:
     """Calibrate a recording: what ``aacmm calibrate`` does, with the same defaults.
 

@@ -27,6 +27,7 @@ from ..acceptance.standards import OF_SPHERES, STANDARDS, checked_standards
 from ..calibration.pose_table import noise_of_poses
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.arguments import NotNegative, OneOf, checked_arguments, with_options
+from ..core.blas_threads import one_blas_thread
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import listed, shorten
@@ -69,6 +70,7 @@ class EvaluationOptions(NamedTuple):
 
 @checked_arguments
 @with_options(EvaluationOptions)
+@one_blas_thread
 def evaluate_capture(record: CalibrationRecord, recording: Recording, **options: Any) -> EvaluationRecord:
     """Evaluate a calibration on a capture: what ``aacmm evaluate`` does, with the same defaults.
 

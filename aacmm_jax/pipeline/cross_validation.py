@@ -17,6 +17,7 @@ from ..calibration.prediction import unseen_errors
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.scale_anchor import fixes_scale
 from ..core.arguments import checked_arguments, items_of, with_options
+from ..core.blas_threads import one_blas_thread
 from ..core.errors import InputError
 from ..core.linear_algebra import inverse_cholesky
 from ..core.numpy_or_jax import to_numpy
@@ -119,6 +120,7 @@ def _determines(capture: Capture, parameters: int) -> bool:
 
 @checked_arguments
 @with_options(CalibrationOptions)
+@one_blas_thread
 def cross_validate(
     arm: Arm, capture: Capture, bounds: Bounds, *, groups: Iterable[str] | None = None, **options: Any
 ) -> CrossValidation:

@@ -17,10 +17,11 @@ from ..data.noise import CLASSES, ArmNoise, class_noise
 from ..data.observations.measured import MeasuredPoints
 from ..data.observations.observation import AbstractObservation, stated_u
 from ..data.observations.pixels import Pixels
-from ..data.recording import Recording
+from ..data.recording import RecordedAs, Recording
 from ..diagnostics.capture_check import check_capture, fits_as_recorded
 from ..diagnostics.reading_check import explanation_words
 from ..diagnostics.reading_fit import Explanation
+from ..diagnostics.reading_search import Hypothesis
 from ..diagnostics.recorded import LARGEST_U, SMALLEST_U
 from ..diagnostics.usability import many_on_bounds
 from ..kinematics.arm import Arm
@@ -113,7 +114,8 @@ def with_corrected_readings(
     nominal = recording.nominal._replace(arm=_with_zeros(recording.nominal.arm, best))
     as_recorded = recording.read_as or range(1, len(best.order) + 1)
     read_as = tuple(sign * as_recorded[column] for sign, column in zip(best.signs, best.order, strict=True))
-    corrected = recording._replace(capture=capture, nominal=nominal, read_as=read_as, recorded_as=None)
+    written = None if recording.recorded_as is None else recorded_as_corrected(recording.recorded_as, best)
+    corrected = recording._replace(capture=capture, nominal=nominal, read_as=read_as, recorded_as=written)
     try:
         again = recorded(solve(corrected), corrected)
     except InputError:
@@ -166,7 +168,7 @@ def corrected_capture(capture: Capture, explanation: Explanation) -> Capture | N
 
     def readings(q: Any) -> np.ndarray:
         values, n = np.array(q), len(explanation.order)
-        values[:, :n] = explanation.hypothesis._replace(offsets=(0.0,) * n).readings(values[:, :n])
+        values[:, :n] = _without_zeros(explanation).readings(values[:, :n])
         return values
 
     def changed(part: AbstractObservation) -> AbstractObservation:
@@ -181,6 +183,20 @@ def corrected_capture(capture: Capture, explanation: Explanation) -> Capture | N
 
     parts = tuple(changed(part) for part in capture.observations)
     return eqx.tree_at(lambda c: (c.q, c.observations), capture, (readings(capture.q), parts))
+
+
+def _without_zeros(explanation: Explanation) -> Hypothesis:
+    """The order, signs and units of an explanation."""
+    return explanation.hypothesis._replace(offsets=(0.0,) * len(explanation.order))
+
+
+def recorded_as_corrected(written: RecordedAs, explanation: Explanation) -> RecordedAs:
+    """How readings are written whose order, signs and units were corrected by an explanation."""
+    correct = _without_zeros(explanation).readings
+    constants = correct(written.constants[None])[0]
+    factors = (correct(written.factors.T + written.constants) - constants).T
+    unit = written.unit if explanation.angle == 1 else ("deg" if explanation.angle < 1 else "rad")
+    return written._replace(unit=unit, factors=factors, constants=constants)
 
 
 def _stated(recording: Recording, explanation: Explanation) -> list[str]:

@@ -24,6 +24,7 @@ from ..calibration.record import record_of
 from ..calibration.results import Calibration, PriorMetrics
 from ..core.arguments import checked_arguments, items_of
 from ..core.arrays import Numbers
+from ..core.blas_threads import one_blas_thread
 from ..core.distributions import student_quantile
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
@@ -191,6 +192,7 @@ def default_models(arm: Arm, capture: Capture) -> tuple[str, ...]:
 
 
 @checked_arguments
+@one_blas_thread
 def compare_models(
     arm: Arm | ArmSpecification,
     capture: Capture,

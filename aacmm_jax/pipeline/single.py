@@ -14,6 +14,7 @@ from ..calibration.task import Solving, Task, task_of, without_lengths
 from ..core._compat import inside_trace
 from ..core.arguments import Count, check_finite, checked_arguments, shown, with_options
 from ..core.arrays import Numbers, is_concrete
+from ..core.blas_threads import one_blas_thread
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.numpy_or_jax import compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture
@@ -60,6 +61,7 @@ class CalibrationOptions(NamedTuple):
 
 @checked_arguments
 @with_options(Solving)
+@one_blas_thread
 def identify(arm: Arm, capture: Capture, bounds: Bounds, **options: Any) -> Identification:
     """Stage 1: the parameters that make the poses of every socket agree, within bounds.
 
@@ -140,6 +142,7 @@ def _check_single(arm: Arm, capture: Capture, bounds: Bounds, many: str) -> None
 
 @checked_arguments
 @with_options(CalibrationOptions)
+@one_blas_thread
 def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **options: Any) -> Calibration:
     """Both stages: identify from repeatability, then fix the scale with the reference lengths.
 

@@ -36,6 +36,7 @@ from jaxtyping import Float
 from ..calibration.solve import solve
 from ..calibration.task import Solving, task_of
 from ..core.arguments import checked_arguments
+from ..core.blas_threads import one_blas_thread
 from ..core.distributions import chi_square_quantile, student_quantile, student_tail
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.numpy_or_jax import to_numpy
@@ -136,6 +137,7 @@ class Verification(NamedTuple):
 
 
 @checked_arguments
+@one_blas_thread
 def verify(recording: Recording, delivered: ArmSpecification | Arm | None = None) -> Verification:
     """Test the parameters that a maker or controller states on a handful of poses, against the nominal parameters.
 

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 
 from ..core.arguments import with_options
 from ..core.arrays import Numbers
+from ..core.blas_threads import one_blas_thread
 from ..core.errors import InputError, nearest
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise
@@ -70,6 +71,7 @@ class Plan(NamedTuple):
 
 
 @with_options(PlanOptions)
+@one_blas_thread
 def plan(
     arm: Arm,
     *,

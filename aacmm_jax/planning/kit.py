@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Int
 
 from ..core.arguments import with_options
+from ..core.blas_threads import one_blas_thread
 from ..core.errors import InputError
 from ..data.capture import Capture
 from ..data.noise import Noise
@@ -70,6 +71,7 @@ class KitPlan(NamedTuple):
 
 
 @with_options(PlanOptions)
+@one_blas_thread
 def plan_kit(arm: Arm, kit: Sequence[KitItem | AbstractSimulated], *, poses: int = 60, **options: Any) -> KitPlan:
     """Choose where to put artefacts, and the poses that determine an arm best with them and with instruments.
 

@@ -320,14 +320,24 @@ def test_conformity_is_of_the_calibrated_parameters(record, full, evaluation, be
     dcc = dcc_xml(record, full.model_copy(update={"conformity": stated}), created=CREATED, evaluation=evaluation)
     assert dcc_model.faults(dcc) == []
     (says,) = [x for x in contents(dcc, "*/dcc:statements") if x.startswith("The statement of conformity holds")]
-    assert says.endswith(english[2:].replace("with", "With") + ".") if english else says.endswith("parameters.")
-    for language, begins, fails in (("en", "conforms, with the c", english), ("de", "konform, mit den k", german)):
-        (text,) = [
-            value
-            for section in printed_certificate(dcc, language=language).pages.pages[1]
-            for key, value in section.facts
-            if key in ("Statement of conformity", "Konformitätsaussage")
-        ]
+    assert (
+        says.endswith(english[2:].replace("with", "With") + ".")
+        if english
+        else says.endswith("parameters loaded into it.")
+    )
+    for language, begins, fails, loaded in (
+        ("en", "conforms, with the c", english, "with the calibrated parameters of this certificate loaded into it"),
+        ("de", "konform, mit den k", german, "wenn die kalibrierten Parameter dieses Kalibrierscheins in ihm geladen"),
+    ):
+        # On the first page, behind the identification; first the verdict, then what it is about, rule and limits.
+        (identified, section, *_), _ = printed_certificate(dcc, language=language).pages.pages
+        assert identified.title.startswith("Identifi")
+        (key, text), *about = section.facts
+        assert key in ("Statement of conformity", "Konformitätsaussage")
+        assert about[0] == ({"en": "Specification", "de": "Spezifikation"}[language], "S")
+        assert about[1][1].startswith("ISO 14253-1:2017")
+        assert about[2][1].startswith("Deltam")
+        assert loaded in section.paragraphs[0]
         assert text.startswith(begins)
         assert fails in text
         assert (";" in text) == bool(fails)

@@ -101,6 +101,15 @@ def test_a_stated_number_that_looks_like_a_uuid_is_printed(record, full):
 
 
 @pytest.mark.slow
+def test_limits_without_a_statement_are_none(record, full, evaluation):
+    about = full.model_copy(update={"conformity": None})
+    dcc = aj.certificate.dcc_xml(record, about, created=CREATED, evaluation=evaluation)
+    (_, conformity, *_), _ = printed_certificate(dcc).pages.pages
+    assert [key for key, _ in conformity.facts] == ["Decision rule", "Limits of the evaluation"]
+    assert conformity.paragraphs == ["No statement of conformity is made."]
+
+
+@pytest.mark.slow
 def test_the_dcc_comes_out_of_the_pdf_as_it_went_in(certificates, read):
     """It is valid, and the PDF says that it is PDF/A-3, which may hold it."""
     dcc = certificates["all stated"]
@@ -141,9 +150,14 @@ def test_what_a_laboratory_states_is_printed(certificates):
     texts = Texts(page).texts
     rule = "ISO 14253-1:2017, Konformität mit einer Wahrscheinlichkeit von 95\u00a0% nachgewiesen"
     decided = f"{rule}; passes where |E| + U is below 0.05 mm", "Deltam\u00a05,0\u00a0mm; E_Uni\u00a00,05\u00a0mm"
-    stated = ("X'1", "0007", "c <7>", "worn & dry", "2025-9", "K 17", "house rule 1", "2026-02-04", *decided)
+    dates = "01.02.2026", "02.02.2026 – 03.02.2026", "04.02.2026"
+    stated = ("X'1", "0007", "c <7>", "worn & dry", "2025-9", "K 17", "house rule 1", *dates, *decided)
     for text in ("Längenlabor <b>&amp; Söhne</b>", *stated):
         assert text in texts, text
+    assert not {"2026-02-01", "2026-02-02 – 2026-02-03", "2026-02-04"} & {*texts}
+    english = Texts(printed_certificate(certificates["all stated"], language="en").html()).texts
+    assert {"2026-02-01", "2026-02-02 – 2026-02-03", "2026-02-04"} <= {*english}
+    assert "<dcc:issueDate>2026-02-04<" in certificates["all stated"]
     assert "20,25\u00a0°C\u00a0(u\u00a0=\u00a00,1\u00a0°C)" in texts
     assert {"b", "script"}.isdisjoint(Texts(page).tags)
     assert "Konformitätsaussage" in texts
@@ -249,6 +263,7 @@ def test_another_language_is_one_file(certificates, tmp_path):
         french.replace("[counts]", 'other = "x"\n[counts]'): ["[sentences] has the unknown key 'other'"],
         french.replace("{number} more", "more"): ["needs the same names in braces"],
         french.replace('"fr"', '"French"'): ["language code"],
+        french.replace("{year}-", ""): ["'{month}-{day}'", "{day}, {month} and {year}"],
     }
     for text, parts in wrong.items():
         path.write_text(text)

@@ -1,11 +1,14 @@
 """Capture manifests: every unit gives the same angles, many files and patterns of files, and bad manifests."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import aacmm_jax as aj
 from tests.refusals import assert_refused
 
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 TURN = 2 * np.pi
 HEAD = 'arm = "cheng2018-simulation"\n'
 ANGLES = '[angles]\nunit = "rad"\n'
@@ -32,6 +35,33 @@ def read(tmp_path, text: str) -> aj.Capture:
     path = tmp_path / "capture.toml"
     path.write_text(text)
     return aj.files.read_manifest(path).capture
+
+
+@pytest.mark.parametrize(
+    ("name", "read", "says"),
+    [
+        (
+            "ur5/ur5.toml",
+            aj.files.read_manifest,
+            "is an arm file, not a manifest: it lacks the key arm and tables of data such as [[socket]] or [[points]]; "
+            "give a manifest with arm = 'ur5.toml', or read the arm with aacmm arm or aj.load_arm.",
+        ),
+        (
+            "ur5/positions.toml",
+            aj.load_arm,
+            "is a manifest, not an arm file; give the arm that it names (arm = 'ur5.toml'), or read the manifest with "
+            "aacmm import or aj.files.read_manifest.",
+        ),
+        ("points.toml", aj.load_arm, "is a manifest of points, not an arm file"),
+        ("points.toml", aj.files.read_manifest, "is a manifest of points, without an arm; read it with aj.files.read"),
+    ],
+)
+def test_a_file_of_another_kind_is_named(tmp_path, name, read, says):
+    path = EXAMPLES / name
+    if name == "points.toml":
+        path = tmp_path / name
+        path.write_text('points = { unit = "mm" }\n' + SOCKET)
+    assert_refused(lambda: read(path), f"{path} {says}")
 
 
 JOINTS = np.arange(1.0, 7.0)

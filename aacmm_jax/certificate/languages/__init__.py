@@ -21,9 +21,16 @@ def _code(text: str) -> str:
     return text
 
 
+def _day(text: str) -> str:
+    if sorted(_NAMED.findall(text)) != ["day", "month", "year"]:
+        raise ValueError(f"{text!r} is not a form of a date; write {{day}}, {{month}} and {{year}} in it, once each.")
+    return text
+
+
 class _File(Strict):
     code: Annotated[str, AfterValidator(_code)]
     decimal: Text
+    day: Annotated[Text, AfterValidator(_day)]
     labels: dict[str, Text]
     sentences: dict[str, Text]
     counts: dict[str, Text]
@@ -36,7 +43,7 @@ class _File(Strict):
     missing: dict[str, Text] = Field(default_factory=dict)
 
 
-_GROUPS = tuple(name for name in _File.model_fields if name not in ("code", "decimal", "missing"))
+_GROUPS = tuple(name for name in _File.model_fields if name not in ("code", "decimal", "day", "missing"))
 # Of keys that other groups have as well.
 _SUFFIXED = {"sentences": "{}_sentence", "places": "place_{}", "kinds": "kind_{}", "metrics": "metric_{}"}
 
@@ -46,6 +53,7 @@ class Language(NamedTuple):
 
     code: str
     decimal: str
+    day: str  # form of a date
     texts: dict[str, str]
     missing: tuple[tuple[re.Pattern[str], str], ...] = ()  # English sentences and what they are in this language
 
@@ -83,6 +91,11 @@ class Language(NamedTuple):
         """A text, or that it is not stated, in this language."""
         return self("not_stated") if text in ("", NOT_STATED) else text
 
+    def date(self, text: str) -> str:
+        """A date of ISO 8601 as this language writes it, "" where there is none."""
+        parts: dict[str, str] = dict(zip(("year", "month", "day"), text.split("-"), strict=False))
+        return _NAMED.sub(lambda match: parts[match[1]], self.day) if len(parts) == 3 else text
+
     def number(self, text: str) -> str:
         """A number, or several, with this language's decimal sign and a proper minus."""
         return text.replace(".", self.decimal).replace("-", "−")
@@ -110,7 +123,7 @@ def language_of(named: str | os.PathLike) -> Language:
         if not set(_NAMED.findall(text)) <= set(_NAMED.findall(key)):
             raise InputError(f"{path}: [missing] {text!r} has other names in braces than {key!r}.")
     missing = ((re.compile(_pattern(key), flags=re.DOTALL), text) for key, text in content.missing.items())
-    return Language(content.code, content.decimal, texts, tuple(missing))
+    return Language(content.code, content.decimal, content.day, texts, tuple(missing))
 
 
 def _pattern(sentence: str) -> str:
