@@ -205,7 +205,7 @@ def _check_summary(
     nominal: Any = None,
     manifest: Path | None = None,
 ) -> dict[str, Any]:
-    from ..diagnostics.joint_travel import standing_rows
+    from ..diagnostics.joint_travel import short_travels, standing_rows
     from ..diagnostics.reading_check import reading_check_summary
     from ..files.reading_checks import angles_toml, units_toml
 
@@ -214,6 +214,7 @@ def _check_summary(
         "angles": angles_toml(check.best, unit, manifest, check.couplings) if angles else None,
         "units": units_toml(check.best, positions) if check.explained or check.couplings else None,
         "standing": standing_rows(specification.arm, capture, nominal),
+        "short_travels": short_travels(specification.arm, capture),
         "reading_sets": [],
         "reading_sets_sentence": "",
         "points": [],
@@ -233,7 +234,7 @@ def reading_check(summary: dict[str, Any]) -> View:
         summary["unit"] and f"The readings are assumed to be in {summary['unit']}.",
         outside and f"Outside the joint limits: {pluralise(outside, 'reading')}.",
         alternatives_sentence(summary["alternatives"], summary["known_positions"]),
-        *(Styled(row["says"], "yellow") for row in summary["standing"]),
+        *(Styled(row["says"], "yellow") for row in (*summary["standing"], *summary["short_travels"])),
         summary["reading_sets_sentence"],
         summary["points_sentence"],
         *_rotations(summary["rotations"]),

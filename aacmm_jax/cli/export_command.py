@@ -186,7 +186,8 @@ def _text(record: Any, specification: Any, form: str, calibrated: bool) -> str:
         from ..files.arms import specification_toml
 
         return specification_toml(specification, source=source)
-    title = ", ".join(part for part in (specification.name, source) if part)
+    name = specification.name.removesuffix(", calibrated") if source else specification.name
+    title = ", ".join(part for part in (name, source) if part)
     written = record.recording.recorded_as
     return files.python_program(specification.arm, title=title, base=first_frame(nominal), recorded_as=written)
 

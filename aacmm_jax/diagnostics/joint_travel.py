@@ -32,6 +32,7 @@ from ..uncertainty.identifiability import observability
 # An error of 1 mm across a joint's axis changes by 0.02 mm while the joint turns by 1 degree, and one of 1 mrad in the
 # direction of a slide by as much over 20 mm: no more than a tip is seated or seen to. Poses within that say nothing.
 _TURN, _SLIDE = 1.0 * DEG, 20.0
+_SHORT = 20.0 * DEG
 _SIGMA = 0.05  # mm, of tips: what these determine no better than usual bounds counts as open
 _TARGET = np.array([100.0, 70.0, 50.0])  # mm
 _QUERIES = 500  # poses of a capture, evenly chosen, whose distance from their nearest neighbour is computed
@@ -65,12 +66,38 @@ def standing_joints(arm: Arm, q: Float[AnyArray, "N n"]) -> tuple[StandingJoint,
         >>> print(aj.diagnostics.standing_joints(arm, capture.q))
         ()
     """
+    most = by_joint(arm, _TURN, _SLIDE)
+    ranges = _ranges(arm, q)
+    return tuple(StandingJoint(i + 1, float(x), len(q)) for i, x in enumerate(ranges) if x < most[i])
+
+
+def _ranges(arm: Arm, q: Float[AnyArray, "N n"]) -> Float[np.ndarray, " n"]:
+    """Between the least and the largest reading of each joint, without whole revolutions, rad or mm."""
     q = np.asarray(q)[:, : arm.joints]
     apart = q - q[:1]
     turned = apart - 2 * np.pi * np.round(apart / (2 * np.pi))
-    ranges = np.ptp(np.where(by_joint(arm, False, True), apart, turned), axis=0)
-    most = by_joint(arm, _TURN, _SLIDE)
-    return tuple(StandingJoint(i + 1, float(x), len(q)) for i, x in enumerate(ranges) if x < most[i])
+    return np.ptp(np.where(by_joint(arm, False, True), apart, turned), axis=0)
+
+
+def short_travels(arm: Arm, capture: Capture) -> list[dict[str, Any]]:
+    """Joints that turn, but by less than 20 degrees over several poses, in one sentence each.
+
+    Their sign and the zeros of joints beside them rest on little: an arc of 20 degrees departs from its chord by 1.5 %
+    of the radius at most.
+    """
+    q = np.asarray(capture.readings)
+    if len(q) < 2:
+        return []
+    turns, rows = by_joint(arm, True, False), []
+    for joint, travel in enumerate(_ranges(arm, q), start=1):
+        if turns[joint - 1] and _TURN <= travel < _SHORT:
+            says = (
+                f"Joint {joint} turns by only {travel / DEG:.2g} deg over {pluralise(len(q), 'pose')}, which hardly "
+                "determines its sign and the zeros of the joints beside it; let it turn by 40 deg or more, if its "
+                "limits allow this."
+            )
+            rows.append({"joint": joint, "range_deg": travel / DEG, "poses": len(q), "says": says})
+    return rows
 
 
 def standing_rows(arm: Arm, capture: Capture, nominal: ArmSpecification | None = None) -> list[dict[str, Any]]:

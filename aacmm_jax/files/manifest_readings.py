@@ -53,6 +53,13 @@ def checked_unit(
     return unit
 
 
+def recorded_as(angles: Angles, arm: Arm, names: Sequence[str]) -> RecordedAs:
+    """How readings are written that ``[angles]`` turns into joint values; ``names`` of their columns."""
+    constants = angles.converted(np.zeros((1, arm.joints)), arm)
+    factors = (angles.converted(np.eye(arm.joints), arm) - constants).T
+    return RecordedAs(tuple(names), angles.lerobot_unit or angles.unit, factors, constants[0])
+
+
 class Readings:
     """Joint readings of tables, in rad and mm, with what was recorded beside them in the last columns (`beside`).
 
@@ -125,13 +132,11 @@ class Readings:
     @property
     def recorded_as(self) -> RecordedAs | None:
         """How the readings of the first table are written; None of a robot of several chains."""
-        angles, n = self.angles, self._arm.joints
+        angles = self.angles
         if angles is None or self._arm.chains:
             return None
-        constants = angles.converted(np.zeros((1, n)), self._arm)
-        factors = (angles.converted(np.eye(n), self._arm) - constants).T
         names = [self.header[i - 1] if i <= len(self.header) else f"column {i}" for i in self.columns]
-        return RecordedAs(tuple(names), angles.lerobot_unit or angles.unit, factors, constants[0])
+        return recorded_as(angles, self._arm, names)
 
     def _chain(self, stated: str | None) -> ChainOf | None:
         """The chain of a robot that the manifest states for a table; None for an arm."""

@@ -192,9 +192,10 @@ class Session:
         try:
             poses = fitting(self._poses_seen, self._stop)
             true = next((arm for device in self._devices if (arm := device.truth()) is not None), None)
-            read_as = next((device.read_as for device in self._devices if device.joints), None)
+            arm = next((device for device in self._devices if device.joints), None)
+            told = {} if arm is None else {"read_as": arm.read_as, "recorded_as": arm.recorded_as}
             sources = tuple(source for device in self._devices for source in device.sources)
-            paths, says = written(self.setup, poses, self.path, calibrate, true, read_as, sources)
+            paths, says = written(self.setup, poses, self.path, calibrate, true, sources, **told)
         finally:
             with self._lock:
                 self._busy = None

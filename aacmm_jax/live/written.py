@@ -4,8 +4,9 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
-from ..data.recording import Recording
+from ..data.recording import RecordedAs, Recording
 from ..files.captures import save_capture
 from ..kinematics.arm import Arm
 from .guidance import Guidance
@@ -34,12 +35,14 @@ def written(
     path: Path,
     calibrate: bool,
     true: Arm | None = None,
-    read_as: tuple[int, ...] | None = None,
     sources: tuple[str, ...] = (),
+    *,
+    read_as: tuple[int, ...] | None = None,
+    recorded_as: RecordedAs | None = None,
 ) -> tuple[list[str], list[str]]:
     """Write a capture, and if asked for its calibration and report beside it; the names of the files, and what the
-    calibration says: its verdict, and its warnings. ``true``: the arm of a simulation; ``read_as`` and
-    ``sources``: those of `Recording`."""
+    calibration says: its verdict, and its warnings. ``true``: the arm of a simulation; ``sources``,
+    ``read_as`` and ``recorded_as``: those of `Recording`."""
     from ..calibration.record import uncertainty_of
     from ..files.calibrations import save_calibration
     from ..pipeline.capture_calibration import calibrate_capture
@@ -50,7 +53,8 @@ def written(
     capture, _ = capture_of(setup, poses)
     simulated = None if true is None else setup.specification._replace(arm=true)
     day = time.strftime("%Y-%m-%d")
-    told = {"usual": setup.noise, "measured": day, "read_as": read_as, "sources": sources}
+    told: dict[str, Any] = {"read_as": read_as, "recorded_as": recorded_as, "sources": sources}
+    told |= {"usual": setup.noise, "measured": day}
     recording = Recording(capture, setup.specification, simulated, **told)
     save_capture(path, recording)
     if not calibrate:

@@ -74,6 +74,16 @@ def test_an_arm_of_which_nothing_can_be_said(aacmm):
 
 
 @pytest.mark.slow
+def test_the_check_names_a_joint_that_moves_too_little(aacmm, tmp_path, few):
+    arm, q = aj.load_arm("cheng2018-simulation"), Q.copy()
+    q[:, 0] = np.linspace(0.0, 11.0, len(q)) * np.pi / 180
+    header = [*(f"q_{i}_rad" for i in range(1, 7)), "x_mm", "y_mm", "z_mm"]
+    write(tmp_path / "poses.csv", header, np.hstack([q, np.asarray(arm.position(q))]))
+    said = aacmm("arm", "cheng2018-simulation", "--check", "poses.csv").stdout
+    assert "Joint 1 turns by only 11 deg over 12 poses" in " ".join(said.split())
+
+
+@pytest.mark.slow
 def test_a_table_of_known_positions(aacmm, tmp_path, few):
     arm = aj.load_arm("cheng2018-simulation")
     columns = (Q * [1, 1, -1, 1, 1, 1])[:, [0, 1, 2, 4, 3, 5]]

@@ -49,6 +49,13 @@ def write(path, header: list[str], rows) -> None:
     path.write_text("\n".join([*lines, *(",".join(map(str, row)) for row in rows)]) + "\n")
 
 
+def test_a_program_is_calibrated_once(arms):
+    command_line(arms[0], "export", "calibration.h5", "-o", "arm.py", "--overwrite")
+    (title,) = [line for line in (arms[0] / "arm.py").read_text().splitlines() if line.startswith("TITLE")]
+    assert title.count("calibrated") == 1
+    assert "calibrated from 40 poses" in title
+
+
 @pytest.mark.parametrize("unit", ["deg", "counts"])
 def test_readings_as_recorded_become_readings_as_recorded(arms, unit):
     """The same joint values as without signs and offsets; names of columns are those of the recording."""

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.diagnostics.joint_travel import lost_by_standing, standing_joints, standing_rows, tried_poses
+from aacmm_jax.diagnostics.joint_travel import (
+    lost_by_standing,
+    short_travels,
+    standing_joints,
+    standing_rows,
+    tried_poses,
+)
 from tests.prismatic_arms import SCARA
 from tests.refusals import assert_refused
 
@@ -21,6 +27,16 @@ def test_still_is_less_than_a_degree(paper_arm, paper_capture):
     (found,) = standing_joints(paper_arm, q)
     assert (found.joint, found.poses) == (5, len(q))
     assert found.range == pytest.approx(0.9 * DEG)
+
+
+def test_a_joint_that_turns_by_less_than_20_degrees_is_named(paper_arm):
+    """A joint that stands still is not, since `standing_rows` names it; nor is one that goes on beyond a revolution."""
+    q = np.tile(np.linspace(0, 1, 5)[:, None], (1, 6))
+    q[:, 0] = np.linspace(0.1, 0.1 + 11 * DEG, 5) + 2 * np.pi * np.array([0, 1, 0, 1, 0])
+    q[:, 2], q[:, 3] = np.linspace(0, 0.9 * DEG, 5), np.linspace(0, 21 * DEG, 5)
+    (row,) = short_travels(paper_arm, aj.Capture({"A": q}))
+    assert (row["joint"], row["poses"], row["range_deg"]) == (1, 5, pytest.approx(11))
+    assert row["says"].startswith("Joint 1 turns by only 11 deg over 5 poses")
 
 
 def test_a_slide_may_move_by_millimetres():

@@ -176,7 +176,10 @@ def test_zeros_of_servos_are_those_of_lerobot_s_calibration(tmp_path, unit):
             aj.live.open_device(f"servos:{tmp_path / 'bus.toml'}", SETUP)
         return
     device = aj.live.open_device(f"servos:{tmp_path / 'bus.toml'}", SETUP)
-    np.testing.assert_allclose(samples_of(device, 1)[-1].q, (100 - np.arange(1, 7)) * 2 * np.pi / 4096)
+    q = samples_of(device, 1)[-1].q
+    np.testing.assert_allclose(q, (100 - np.arange(1, 7)) * 2 * np.pi / 4096)
+    assert (device.recorded_as.names[0], device.recorded_as.unit) == ("servo 1", "counts")
+    np.testing.assert_allclose(device.recorded_as.joint_values(np.full((1, 6), 2100.0))[0], q)
     assert [source.split()[0] for source in device.sources] == ["motors.json"]
     device.close()
 

@@ -182,10 +182,17 @@ def test_a_session_is_continued_with_the_same_capture(tmp_path):
                 device.hold(last)
             state = session.state()
     assert [pose["place"] for pose in state["poses"]] == ["A", "A", "bar/1", "bar/1"]
-    with aj.live.Session(SETUP, [Scripted()], path=path) as session:
+    last_device = Scripted()
+    last_device.read_as = (1, -2, *range(3, ARM.joints + 1))
+    last_device.recorded_as = aj.data.RecordedAs(
+        tuple(f"servo {i}" for i in range(ARM.joints)), "counts", 1e-3 * np.eye(ARM.joints), np.full(ARM.joints, 0.5)
+    )
+    with aj.live.Session(SETUP, [last_device], path=path) as session:
         assert session.finish(calibrate=False) == [str(path)]
-    loaded = aj.files.load_capture(path).capture
-    assert (loaded.sizes, [part.name for part in loaded.observations]) == ((2,), ["bar"])
+    recording = aj.files.load_capture(path)
+    assert (recording.capture.sizes, [part.name for part in recording.capture.observations]) == ((2,), ["bar"])
+    assert (recording.read_as, recording.recorded_as.unit) == (last_device.read_as, "counts")
+    np.testing.assert_array_equal(recording.recorded_as.factors, last_device.recorded_as.factors)
 
 
 def test_two_processes_cannot_have_one_journal(session, tmp_path):

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from ...core.errors import InputError, nearest
 from ...core.text import number
+from ...data.recording import RecordedAs
 from ...kinematics.arm import Arm
 from ..places import Place
 from ..samples import Sample
@@ -27,6 +28,7 @@ class AbstractDevice(abc.ABC):
         lines: How many lines, messages or images were read.
         bad: How many of these could not be used, by reason.
         read_as: Which of its readings is that of each joint, and in which direction (`Recording.read_as`).
+        recorded_as: How its readings are written (`Recording.recorded_as`); None where that is not known.
         sources: Files that its readings depend on (`Recording.sources`).
 
     Example:
@@ -45,6 +47,7 @@ class AbstractDevice(abc.ABC):
     message: str = ""
     lines: int = 0
     read_as: tuple[int, ...] | None = None
+    recorded_as: RecordedAs | None = None
     sources: tuple[str, ...] = ()
     bad: Counter[str]
 

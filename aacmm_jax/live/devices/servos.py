@@ -15,6 +15,7 @@ from pydantic import Field, NonNegativeInt, PositiveInt
 from ...core.errors import InputError, require
 from ...files.controllers.lerobot import angles_by_motors
 from ...files.inputs import InputFile, fingerprint
+from ...files.manifest_readings import recorded_as
 from ...files.manifest_tables import Angles
 from ...files.toml import Strict, read_toml
 from ..places import Setup
@@ -63,6 +64,8 @@ class Servos(AbstractDevice):
                 raise InputError(f"{where}: servos answer in counts; write unit = 'counts' beside calibration.")
             file = InputFile(Path(where).parent / bus.angles.calibration)
             self._angles, self.sources = angles_by_motors(bus.angles, file, self.joints), (fingerprint(file),)
+        if not self._arm.chains and self.joints == self._arm.joints:
+            self.recorded_as = recorded_as(self._angles, self._arm, [f"servo {servo}" for servo in bus.ids])
         usual = _ADDRESSES[bus.protocol]
         self._address, self._bytes = bus.address or usual[0], bus.bytes or usual[1]
         self._silent = 0
