@@ -81,9 +81,9 @@ SETS = {
         "with its corrections, and measured the robot again. Their figure therefore contains what the robot repeats "
         "(0.1 mm according to the maker), what it drifted between the two measurements, and the base frame found "
         "beforehand. Ours is a prediction for other poses of the same recording, between the poses calibrated with: an "
-        "easier test. The 20 poses were not used here. The sign of the recorded differences is not stated; both signs "
-        f"fit alike. {TRACKER}The nominal robot's frames were fitted to the poses, so that its error is less than the "
-        "2.566 mm of the authors.",
+        "easier test. The 20 poses were not used here. The data set does not state the sign of the differences; "
+        f"`examples/ur5/README.md` says how it was found. {TRACKER}The nominal robot's frames were fitted to the "
+        "poses, so that its error is less than the 2.566 mm of the authors.",
     ),
     "ur5-octants": Set(
         "ur5/positions.toml",

@@ -71,6 +71,7 @@ _SAME = 1e-9  # of the residuals: the two arms do not differ in these poses
 _MOST = 1000  # poses that may be asked for
 _RANK = 1e-9
 _TURNED = 3e-3  # of the residuals: so far they follow some steps of 1 mrad, and of 1 mm in 1 m
+_BY_LENGTHS = 0.9  # share of a direction's information, from which lengths show it, and poses hardly
 _FIXED = ("d_1",)  # a solve has at least one parameter; this one does not change
 _FEWEST = 4  # poses
 _LEAST_LEFT = 1e-6  # share of a row that the unknowns leave: what they explain whole shows no error
@@ -272,9 +273,10 @@ class _Rows(NamedTuple):
         return cls(_without(basis, values), basis, owner, fit.observed.q.shape[0])
 
 
-def _stacked(linear: Linearisation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _stacked(linear: Linearisation, noise: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """All rows in standard deviations, their derivatives, and the pose of each; reference lengths and certified values
-    have numbers of their own."""
+    have numbers of their own. Rows of poses have errors of ``noise`` standard deviations, and so have those of lengths
+    by the u that is stated for them."""
     values, columns, pose, first = [], [], [], 0
     for part, derivative in zip(linear.parts(), linear.dense(), strict=True):
         white = part.without_rest().white  # a last row that stands for the noise of many corners knows no arm
@@ -284,7 +286,7 @@ def _stacked(linear: Linearisation) -> tuple[np.ndarray, np.ndarray, np.ndarray]
         pose.append(np.repeat(first + np.arange(poses), rows))
         first += poses
     derivatives, errors, u = linear.relations()
-    weight = 1 / np.maximum(u, LEAST_U)
+    weight = noise / np.maximum(u, LEAST_U)
     return (
         np.concatenate([*values, weight * errors]),
         np.concatenate([*columns, weight[:, None] * derivatives]),
@@ -387,6 +389,59 @@ def _paired(nominal: _Rows, delivered: _Rows) -> _Paired:
     return _Paired(share, u, half_width, probability, False)
 
 
+class _Posterior(NamedTuple):
+    """Of the parameters' errors in natural steps, for each size s of them and each noise t.
+
+    In the basis of the singular vectors its covariance is diagonal.
+    """
+
+    weight: Float[np.ndarray, "s t"]
+    mean: Float[np.ndarray, "s t p"]
+    spread: Float[np.ndarray, "s t p"]  # variance
+    basis: Float[np.ndarray, "p p"]
+
+    @classmethod
+    def of_rows(
+        cls,
+        values: Float[np.ndarray, " R"],
+        columns: Float[np.ndarray, "R k"],
+        steps: Float[np.ndarray, " p"],
+        lengths: int,
+    ) -> "_Posterior":
+        """From rows, of which the last ones are of ``lengths``, and their derivatives, first by the parameters, then by
+        the unknowns, which are eliminated."""
+        parameters = len(steps)
+        explained = _basis(columns[:, parameters:])
+        columns, values = _without(explained, columns[:, :parameters] * steps), _without(explained, values)
+        left, sizes, right = np.linalg.svd(columns, full_matrices=len(columns) < parameters)
+        # A turn or a scaling of everything moves no row but by turning or scaling its residual, which says nothing.
+        # Not so of a direction that lengths show.
+        by_lengths = np.sum(left[len(values) - lengths :, : len(sizes)] ** 2, axis=0) > _BY_LENGTHS
+        determined = sizes > np.maximum(_RANK * sizes[0], np.where(by_lengths, 0, _TURNED * np.linalg.norm(values)))
+        seen = np.where(determined, left.T @ values, 0.0)
+        unseen = len(values) - explained.shape[1] - int(np.sum(determined))
+        sizes, seen = (np.pad(part, (0, parameters - len(part))) for part in (np.where(determined, sizes, 0), seen))
+        scale, noise = _SCALES[:, None, None], _NOISES[None, :, None]
+        variance = scale**2 * sizes**2 + noise**2
+        evidence = np.sum(np.where(sizes > 0, np.log(variance) + seen**2 / variance, 0.0), axis=2)
+        rest = max(float(values @ values - seen @ seen), 0.0)
+        evidence += (unseen * np.log(noise**2) + rest / noise**2)[..., 0] + (np.log(scale[..., 0]) / _FACTOR) ** 2
+        weight = np.exp(-(evidence - evidence.min()) / 2)
+        mean, spread = -(scale**2) * sizes * seen / variance, scale**2 * noise**2 / variance
+        return cls(weight / weight.sum(), mean, spread, right.T)
+
+    @property
+    def noise(self) -> float:
+        """Expected noise of the poses, in the standard deviations of the rows."""
+        return math.sqrt(np.sum(self.weight * _NOISES**2))
+
+    def drawn(self, random: np.random.Generator) -> Float[np.ndarray, "d p"]:
+        """Errors that it holds likely."""
+        cells = random.choice(self.weight.size, _DRAWS, p=self.weight.ravel())
+        mean, spread = (values.reshape(self.weight.size, -1)[cells] for values in (self.mean, self.spread))
+        return mean + np.sqrt(spread) * random.normal(size=spread.shape)
+
+
 class _Volume(NamedTuple):
     """What these poses say of the errors of an arm over the working volume."""
 
@@ -413,25 +468,11 @@ class _Volume(NamedTuple):
         geometry = np.asarray(fit.z)[len(fit.space.names) :]
         space = Parameters(arm, (*names, *tip))
         z = np.concatenate([np.asarray(space.vector()), geometry])
-        values, columns, _ = _stacked(Linearisation.at(fit.observed, space, z, sigma=sigma, least=LEAST_U))
-        unknowns, steps = _basis(columns[:, len(names) :]), natural_steps(names)
-        columns = _without(unknowns, columns[:, : len(names)] * steps)
-        values = _without(unknowns, values)
-        left, sizes, right = np.linalg.svd(columns, full_matrices=len(columns) < len(names))
-        # A turn or a scaling of everything moves no row but by turning or scaling its residual, which says nothing.
-        determined = sizes > max(_RANK * sizes[0], _TURNED * np.linalg.norm(values))
-        seen = np.where(determined, left.T @ values, 0.0)
-        unseen = len(values) - unknowns.shape[1] - int(np.sum(determined))
-        sizes, seen = (np.pad(part, (0, len(names) - len(part))) for part in (np.where(determined, sizes, 0), seen))
-        scale, noise = _SCALES[:, None, None], _NOISES[None, :, None]
-        variance = scale**2 * sizes**2 + noise**2
-        evidence = np.sum(np.where(sizes > 0, np.log(variance) + seen**2 / variance, 0.0), axis=2)
-        rest = max(float(values @ values - seen @ seen), 0.0)
-        evidence += (unseen * np.log(noise**2) + rest / noise**2)[..., 0] + (np.log(scale[..., 0]) / _FACTOR) ** 2
-        weight = np.exp(-(evidence - evidence.min()) / 2)
-        weight /= weight.sum()
-        # In the basis of the singular vectors the posterior's covariance is diagonal.
-        mean, spread = -(scale**2) * sizes * seen / variance, scale**2 * noise**2 / variance
+        linear, steps = Linearisation.at(fit.observed, space, z, sigma=sigma, least=LEAST_U), natural_steps(names)
+        lengths = len(linear.relations()[2])
+        posterior = _Posterior.of_rows(*_stacked(linear)[:2], steps, lengths)
+        if lengths:  # u of a length is in mm, and not in units of the noise, which is known only now
+            posterior = _Posterior.of_rows(*_stacked(linear, posterior.noise)[:2], steps, lengths)
         limits = np.asarray(joint_limits(arm, None))
         limits = np.where(np.array(by_joint(arm, True, False))[:, None], np.clip(limits, -math.pi, math.pi), limits)
         random = np.random.default_rng(0)
@@ -441,11 +482,9 @@ class _Volume(NamedTuple):
         free = np.concatenate([turned, np.tile(np.eye(3), (_TESTED, 1, 1)), by[:, :, len(names) :]], axis=2)
         frames, by = _basis(free.reshape(3 * _TESTED, -1)), by[:, :, : len(names)].reshape(3 * _TESTED, -1)
         step = _without(frames, (np.asarray(other.position(q)) - tips).ravel())
-        by_parameters = _without(frames, by) * steps @ right.T
-        remaining = float(np.sum(weight * (spread @ np.sum(by_parameters**2, axis=0))))
-        cells = random.choice(weight.size, _DRAWS, p=weight.ravel())
-        mean, spread = (values.reshape(weight.size, -1)[cells] for values in (mean, spread))
-        errors = (mean + np.sqrt(spread) * random.normal(size=spread.shape)) @ by_parameters.T
+        by_parameters = _without(frames, by) * steps @ posterior.basis
+        remaining = float(np.sum(posterior.weight * (posterior.spread @ np.sum(by_parameters**2, axis=0))))
+        errors = posterior.drawn(random) @ by_parameters.T
         own, others = np.sum(errors**2, axis=1), np.sum((errors - step) ** 2, axis=1)
         probability, ratio = float(np.mean(others < own)), np.sqrt(others / np.maximum(own, 1e-300))
         return cls(probability, ratio, np.sqrt(own / _TESTED), math.sqrt(remaining / _TESTED))

@@ -141,6 +141,23 @@ def test_the_same_parameters_are_compared_with_a_calibration():
     assert (between["enough"], between["achieved"]) == ("not decided", False)
 
 
+@pytest.mark.slow
+def test_the_uncertainty_of_a_length_counts_in_what_a_calibration_would_leave():
+    """The scale is u / length, whatever the nominal arm errs by in these poses: over the working volume of a UR5e
+    (reach 850 mm), whose base and tip are fitted, 1e-3 are some tenths of a millimetre. A u that says nothing of the
+    scale leaves what is left without a length."""
+    nominal, real, _ = arms(3, 1.0, 0.0)
+
+    def left(*u):
+        measured = [aj.ReferenceLength("A", "B", 100.0, u=x) for x in u]
+        return aj.verify(recording(nominal, real, 24, measured), nominal).recalibrated
+
+    known, *uncertain = (left(u) for u in (0.01, 0.05, 0.1))
+    reach = [np.sqrt(found**2 - known**2) / (u / 100) for found, u in zip(uncertain, (0.05, 0.1), strict=True)]
+    assert 250 < min(reach) < max(reach) < 600
+    assert left(20.0) == pytest.approx(left(), rel=0.02)
+
+
 def drawn(random: np.random.Generator, share: float, clusters: int = 12) -> tuple[_Rows, _Rows]:
     """Residuals of two arms, of which the second has so much of what lies between them, with unknowns eliminated."""
     basis = np.linalg.qr(random.normal(size=(3 * clusters, 4)))[0]
