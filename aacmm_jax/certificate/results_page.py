@@ -61,7 +61,9 @@ def _findings(statements: dict, words: Language) -> Iterator[Section]:
         notes += more(len(found) - _MOST_FINDINGS, words)
     else:
         names = (name for says in left_out for name in says.rpartition(LEFT_OUT_NAMES)[2].removesuffix(".").split(", "))
-        notes = [words("left_out_sentence", names=_by_socket(names, words))] if left_out else []
+        reasons = "; ".join(filter(None, dict.fromkeys(map(words.reason, left_out))))
+        stated = " – ".join(filter(None, (_by_socket(names, words), reasons)))
+        notes = [words("left_out_sentence", names=stated)] if left_out else []
         notes += [words.counted("warnings_sentence", str(len(warnings)))] if warnings else []
     if notes:
         yield Section(words("findings"), notes=notes)

@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import re
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from aacmm_jax.acceptance import requirements
 from aacmm_jax.certificate import languages
 from aacmm_jax.certificate.languages import language_of
+from aacmm_jax.diagnostics import misplaced_poses
 from tests.refusals import assert_refused
 
 
@@ -49,3 +51,31 @@ def test_a_language_may_lack_these_sentences(tmp_path, missing, said):
     assert language_of(path).translated("3 are required.") == said
     path.write_text(english + '\n[missing]\n"{1} are required." = "{2}"\n')
     assert_refused(lambda: language_of(path), path, "[missing]", "other names in braces")
+
+
+@pytest.mark.parametrize(
+    ("says", "german"),
+    [
+        ("recorded under b-1, but B.2 fits", "aufgezeichnet unter b-1, passend zu B.2"),
+        ("A and B are exchanged: poses of each fit the other", "A und B vertauscht"),
+        ("the readings of A pose 1 and A pose 2 are exchanged: each fits with those of the other", "ihre Ablesungen"),
+        ("the readings are 1 row late: these poses fit with those of the next row", "kommen 1 Zeile zu spät"),
+        ("the readings are 2 rows early: these poses fit with those of 2 rows further", "kommen 2 Zeilen zu früh"),
+        ("0.31 mm off", "0,31 mm entfernt"),
+        ("5 mm off, as if the reading of joint 3 were wrong by -1.5 deg", "von Gelenk 3 um −1,5° falsch"),
+    ],
+)
+def test_german_says_why_poses_were_left_out(says, german):
+    finding = f"Left out: A (1) pose 1 ({says}), which contradicts the other data (F = 9 with 6 and 42 degrees)."
+    assert german in language_of("de").reason(finding)
+    assert language_of("en").reason(finding) == ""
+    assert language_of("de").reason("Left out: socket A, which contradicts the other data (F = 9).") == ""
+    source = inspect.getsource(misplaced_poses)
+    written = languages.read_toml(Path(languages.__file__).parent / "de.toml", languages._File).reasons
+    parts = [
+        part
+        for key in written
+        for part in re.split(r"\{\d\}| rows? late: | rows? early: |(?<=off)(?=,)", key)
+        if len(part) > 4
+    ]
+    assert [part for part in parts if part not in source] == []

@@ -43,6 +43,23 @@ def test_every_key_is_in_it_and_valid(tmp_path):
     assert tomllib.loads(re.sub(r"#.*", "", text)) == tomllib.loads(text)
 
 
+def test_what_a_first_user_fills_in_is_short_and_complete(tmp_path):
+    """All that is not a comment stands before the optional part, and is an arm file by itself."""
+    needed, mark, optional = arm_template(6).partition("\n# Optional")
+    assert mark
+    assert len(needed.split()) <= 320
+    rows = needed.index("joint = [")
+    assert len(needed[:rows].split()) <= 170
+    assert [line for line in optional.splitlines()[1:] if line and not line.startswith("#")] == []
+    (tmp_path / "my.toml").write_text(needed)
+    (tmp_path / "all.toml").write_text(arm_template(6))
+    first, whole = (aj.files.load_specification(tmp_path / name) for name in ("my.toml", "all.toml"))
+    np.testing.assert_array_equal(first.arm.alpha, whole.arm.alpha)
+    assert set(tomllib.loads(needed)) == {
+        "name", "source", "convention", "length_unit", "angle_unit", "probe", "joint"
+    }  # fmt: skip
+
+
 @pytest.mark.parametrize("joints", [0, 21])
 def test_numbers_of_joints_that_no_arm_has(joints):
     with pytest.raises(aj.InputError, match="from 1 to 20"):

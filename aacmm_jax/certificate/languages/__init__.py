@@ -41,9 +41,10 @@ class _File(Strict):
     kinds: dict[str, Text]
     metrics: dict[str, Text]
     missing: dict[str, Text] = Field(default_factory=dict)
+    reasons: dict[str, Text] = Field(default_factory=dict)
 
 
-_GROUPS = tuple(name for name in _File.model_fields if name not in ("code", "decimal", "day", "missing"))
+_GROUPS = tuple(name for name in _File.model_fields if name not in ("code", "decimal", "day", "missing", "reasons"))
 # Of keys that other groups have as well.
 _SUFFIXED = {"sentences": "{}_sentence", "places": "place_{}", "kinds": "kind_{}", "metrics": "metric_{}"}
 
@@ -56,6 +57,7 @@ class Language(NamedTuple):
     day: str  # form of a date
     texts: dict[str, str]
     missing: tuple[tuple[re.Pattern[str], str], ...] = ()  # English sentences and what they are in this language
+    reasons: tuple[tuple[re.Pattern[str], str], ...] = ()  # for which poses were left out, likewise
 
     def __call__(self, key: str, **values: str) -> str:
         """The text of a key, with values for the names in its braces."""
@@ -86,6 +88,15 @@ class Language(NamedTuple):
             translated.append(_NAMED.sub(lambda name, numbers=numbers: numbers[name[1]], text))
             end = match.end()
         return " ".join(translated).replace(" %", "\u00a0%")
+
+    def reason(self, finding: str) -> str:
+        """For which reason a finding says that poses were left out; "" where this language does not have it."""
+        for pattern, text in self.reasons:
+            if match := pattern.search(finding):
+                of = {name[1:]: value for name, value in match.groupdict().items()}
+                of = {name: self.number(x) if re.fullmatch(r"-?[\d.]+", x) else x for name, x in of.items()}
+                return _NAMED.sub(lambda name, of=of: of[name[1]], text)
+        return ""
 
     def stated(self, text: str) -> str:
         """A text, or that it is not stated, in this language."""
@@ -119,15 +130,19 @@ def language_of(named: str | os.PathLike) -> Language:
             if set(_NAMED.findall(given[key])) != set(_NAMED.findall(wanted[key])):
                 raise InputError(f"{path}: [{group}] {key!r} needs the same names in braces as {wanted[key]!r}.")
             texts[_SUFFIXED.get(group, "{}").format(key)] = given[key]
-    for key, text in content.missing.items():
-        if not set(_NAMED.findall(text)) <= set(_NAMED.findall(key)):
-            raise InputError(f"{path}: [missing] {text!r} has other names in braces than {key!r}.")
-    missing = ((re.compile(_pattern(key), flags=re.DOTALL), text) for key, text in content.missing.items())
-    return Language(content.code, content.decimal, content.day, texts, tuple(missing))
+    for table, sentences in (("missing", content.missing), ("reasons", content.reasons)):
+        for key, text in sentences.items():
+            if not set(_NAMED.findall(text)) <= set(_NAMED.findall(key)):
+                raise InputError(f"{path}: [{table}] {text!r} has other names in braces than {key!r}.")
+    missing = [(_pattern(key, ".+?", "", r"(?:\s|$)"), text) for key, text in content.missing.items()]
+    reasons = [
+        (_pattern(key, "[^()]+?", r"\(", r"\), which contradict"), text) for key, text in content.reasons.items()
+    ]
+    return Language(content.code, content.decimal, content.day, texts, tuple(missing), tuple(reasons))
 
 
-def _pattern(sentence: str) -> str:
-    """A regular expression of a sentence with any texts in its braces."""
+def _pattern(sentence: str, any_text: str, before: str, after: str) -> re.Pattern[str]:
+    """A regular expression of a sentence with any texts in its braces, between two others."""
     parts = _NAMED.split(sentence)
-    texts = [re.escape(part) if i % 2 == 0 else f"(?P<n{part}>.+?)" for i, part in enumerate(parts)]
-    return "".join(texts) + r"(?:\s|$)"
+    texts = [re.escape(part) if i % 2 == 0 else f"(?P<n{part}>{any_text})" for i, part in enumerate(parts)]
+    return re.compile(before + "".join(texts) + after, flags=re.DOTALL)
