@@ -20,6 +20,7 @@ from .options import argument, option, output
     "aacmm verify poses.toml --delivered kinematics.yaml",
     "aacmm verify poses.toml --delivered panda --max-rms-mm 1 -o verified.html",
     "aacmm verify capture.h5 --delivered robot-as-delivered.urdf --tip tool0",
+    "aacmm verify poses.toml --delivered panda --calibration calibration.h5 -o verified.html",
 )
 def verify(
     capture: Path = argument(
@@ -39,6 +40,9 @@ def verify(
         "RMS error of the tip that your task allows: say whether the delivered parameters meet it, and exit with "
         "code 1 unless they do.",
         min=0,
+    ),
+    calibration: Path | None = option(
+        "Calibration of this arm: state its error in held-out poses beside the verdict.", "CALIBRATION.h5"
     ),
     output: Path | None = output(
         "Page for printing: verdict, picture, numbers, and what was not tested.", "PAGE.html", default=None
@@ -66,6 +70,7 @@ def verify(
     named = None if arm is None or os.path.isfile(str(delivered)) else arm
     if named is not None and named.arm.joints == recording.nominal.arm.joints:
         _refuse_another_robot(recording.nominal, named)
+    held_out = None if calibration is None else _cross_validated(calibration, recording.nominal.name)
     checked = with_spinner("Verifying", lambda: run(recording, arm))
     given, measured = arm or recording.as_found, recording.capture
     summary = summaries.verification.verification_summary(
@@ -74,6 +79,7 @@ def verify(
         delivered or ("" if given is None else given.name),
         scaled=bool(measured.lengths or measured.observations),
         max_rms=max_rms_mm,
+        calibrated=held_out,
     )
     if named is not None and named.name != recording.nominal.name:
         summary["warnings"].append(
@@ -82,13 +88,26 @@ def verify(
     if output is not None:
         from ..report import write_verification
 
-        files_read = [path for path in (capture, delivered) if path and os.path.isfile(path)]
+        files_read = [path for path in (capture, delivered, calibration) if path and os.path.isfile(path)]
         sources = dict.fromkeys([*map(fingerprint, files_read), *recording.sources])
         write_verification(output, checked, measured, summary, sources=list(sources))
         summary["written"] = str(output)
     show_summary(summary, as_json, summaries.verification.verification)
     if not summary["achieved"]:
         raise typer.Exit(1)
+
+
+def _cross_validated(path: Path, arm: str) -> Any:
+    """The cross-validation of a calibration of the arm with this name."""
+    record = files.load_calibration(path)
+    if record.validation is None:
+        raise InputError(f"{path} has no cross-validation; calibrate this recording with --cross-validate.")
+    if record.recording.nominal.name != arm:
+        raise InputError(
+            f"{path} is of '{record.recording.nominal.name}', and not of '{arm}', the arm of the recording; give a "
+            "calibration of this recording."
+        )
+    return record.validation
 
 
 def _refuse_another_robot(nominal: Any, arm: Any) -> None:

@@ -151,7 +151,7 @@ def calibration(summary: dict[str, Any]) -> View:
     stages = {stage: name for stage, name in STAGES.items() if stage != "stage1" or summary["method"] != "joint"}
     fixed_scale = summary["fixed_by_one_length"]
     if summary["nominal"] and summary["parameters"]:
-        title = "Errors in the poses used for identification [mm]"
+        title = "Errors in the poses used for identification (nominal: with the tip as stated) [mm]"
         yield tables.metrics_table(title, summary, stages, fixed_scale=fixed_scale)
     if "truth" in summary:
         yield tables.truth_table(summary["truth"])

@@ -35,6 +35,10 @@ def verification_report(checked: Verification, capture: Capture, summary: dict[s
     found, not_tested = (summary["poses_say"], summary["gain_says"]), "; ".join(summary["not_tested"])
     left = f"over the working volume, in place of {checked.volume:.2g} mm"
     calibrated = ("After a calibration with these poses", f"at least {checked.recalibrated:.2g} mm", left)
+    if "calibrated" in summary:
+        tested = summary["calibrated"]
+        calibrated = ("Calibrated, held-out poses", f"{tested['rms_mm']:.3g} mm", f"RMS; {tested['groups']} groups")
+        found = (tested["says"], *found)
     return Report(
         title=f"Verification of delivered parameters, {summary['arm'] or 'an arm'}",
         subtitle=f"{counted(summary)} Delivered: {summary['delivered']}",

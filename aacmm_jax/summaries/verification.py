@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from ..calibration.agreement import CrossValidation
 from ..core.text import pluralise
 from ..pipeline.verification import LEVEL, MARGIN, Accuracy, Verification
 from ..uncertainty.coverage import LEVEL_IN_PERCENT, U_AT_LEVEL
@@ -21,11 +22,16 @@ _REAL_SHARE = (
 
 
 def verification_summary(
-    checked: Verification, arm: str, delivered: str, scaled: bool = True, max_rms: float | None = None
+    checked: Verification,
+    arm: str,
+    delivered: str,
+    scaled: bool = True,
+    max_rms: float | None = None,
+    calibrated: CrossValidation | None = None,
 ) -> dict[str, Any]:
     """What ``verify`` reports of the nominal arm and the delivered parameters with these names, mm; ``scaled`` says
-    whether a certified length, a board or an instrument tests the scale, and ``max_rms`` which RMS error the task
-    allows."""
+    whether a certified length, a board or an instrument tests the scale, ``max_rms`` which RMS error the task
+    allows, and ``calibrated`` are the held-out poses of a calibration."""
     enough = None if max_rms is None or checked.mismatch else _enough(checked.delivered, max_rms)
     rows = [
         {"parameters": name} | _accuracy(accuracy) | {"length_errors_mm": plain(errors)}
@@ -35,7 +41,8 @@ def verification_summary(
         )
     ]
     share = [None] * 3 if checked.same else [checked.share, checked.share_lower, checked.share_upper]
-    return {
+    held_out = {} if calibrated is None else {"calibrated": _held_out(checked, calibrated)}
+    return held_out | {
         "kind": "verification",
         "arm": arm,
         "delivered": delivered,
@@ -72,6 +79,17 @@ _NOT_TESTED = (
     "the working volume far from these poses: the errors expected there follow from D-H parameters alone",
     "other loads, speeds and temperatures, and what changes with time",
 )
+
+
+def _held_out(checked: Verification, calibrated: CrossValidation) -> dict[str, Any]:
+    """The error of a calibration in poses that it had not used, beside that of the delivered parameters."""
+    groups = pluralise(len(calibrated.groups), "group")
+    return {
+        "rms_mm": calibrated.rms,
+        "groups": len(calibrated.groups),
+        "says": f"Calibrated: {calibrated.rms:.3g} mm RMS in held-out poses ({groups}, each held out once, with its "
+        f"sockets and frames fitted again), in place of {checked.delivered.rms:.3g} mm as delivered (tip fitted).",
+    }
 
 
 def _accuracy(accuracy: Accuracy) -> dict[str, Any]:
@@ -225,7 +243,8 @@ def mark_of(summary: dict[str, Any]) -> str:
 def verification(summary: dict[str, Any]) -> View:
     """What people see of it."""
     yield Styled(summary["says"], STYLES[mark_of(summary)])
-    yield from filter(None, (f"To do: {summary['do']}.", summary["poses_say"], summary["gain_says"]))
+    held_out = summary["calibrated"]["says"] if "calibrated" in summary else ""
+    yield from filter(None, (f"To do: {summary['do']}.", held_out, summary["poses_say"], summary["gain_says"]))
     yield from warnings_of(summary)
     yield accuracy_table(summary)
     yield counted(summary)

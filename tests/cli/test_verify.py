@@ -80,6 +80,26 @@ def test_data_that_do_not_match_the_arm_get_no_verdict(aacmm, robot, unit, lengt
     assert "After a calibration" not in page
 
 
+@pytest.mark.slow
+def test_the_held_out_result_of_a_calibration_stands_beside_the_verdict(aacmm, robot, mukca):
+    """As found by a reader: verdict and held-out error had to be put together from two commands."""
+    recorded = mukca / "panda_6.toml"
+    aacmm("calibrate", recorded, "-o", "c.h5", "--model", "dh")
+    options = ("verify", recorded, "--delivered", "panda", "--calibration")
+    summary = json.loads(aacmm(*options, "c.h5", "-o", "page.html", "--json", expect=1).stdout)
+    known = json.loads(aacmm("show", "c.h5", "--json").stdout)["cross_validation"]
+    assert (summary["calibrated"]["rms_mm"], summary["calibrated"]["groups"]) == (known["rms_mm"], known["groups"])
+    says = f"Calibrated: {known['rms_mm']:.3g} mm RMS in held-out poses (3 groups, each held out once"
+    page = " ".join((robot / "page.html").read_text("utf-8").split())
+    assert says in summary["calibrated"]["says"]
+    assert says in page
+    assert "Calibrated, held-out poses" in page
+    other = aacmm("verify", "poses.toml", "--delivered", "nominal.toml", "--calibration", "c.h5", expect=2)
+    assert "and not of 'nominal', the arm of the recording" in " ".join(other.stderr.split())
+    aacmm("calibrate", recorded, "-o", "plain.h5", "--model", "dh", "--no-cross-validate")
+    assert "has no cross-validation" in " ".join(aacmm(*options, "plain.h5", expect=2).stderr.split())
+
+
 def test_a_plate_is_made_with_the_lines_of_its_manifest(aacmm, tmp_path):
     printed = aacmm("sockets", "-o", "plate.stl", "--drawing", "plate.pdf", "--distance-mm", 80).stdout
     assert (tmp_path / "plate.pdf").read_bytes().startswith(b"%PDF")
