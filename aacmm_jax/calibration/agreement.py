@@ -7,9 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..core.distributions import chance
+from ..core.distributions import chance, student_quantile
 from ..core.text import common_labels
 from ..uncertainty.between_groups import BetweenGroups, more_uncertain
+from ..uncertainty.coverage import LEVEL
 
 SIGNIFICANCE = 0.01  # probability below which errors beyond their prediction are not put down to chance
 _HALF = SIGNIFICANCE / 2  # for single groups of a cross-validation; the other half is for all of them together
@@ -66,6 +67,7 @@ class LeftOut(NamedTuple):
     rms_degrees_of_freedom: float = math.nan
     length_degrees_of_freedom: float = math.nan
     noise_degrees_of_freedom: float = math.inf
+    distances: Float[np.ndarray, " m"] | None = None  # of its poses; NaN alone in a socket; None: of an earlier file
 
     @property
     def normalised_lengths(self) -> np.ndarray:
@@ -147,9 +149,35 @@ class CrossValidation(NamedTuple):
         if name.startswith("length"):
             values, u = (np.concatenate([getattr(group, n) for group in self.groups]) for n in (name, "length_u"))
             return float(np.sqrt(np.mean(values[np.isfinite(u)] ** 2))) if np.isfinite(u).any() else math.nan
-        counted = [group for group in self.groups if group.poses and np.isfinite(group.rms_predicted)]
+        counted = self._counted
         squares = sum(group.poses * getattr(group, name) ** 2 for group in counted)
         return math.sqrt(squares / sum(group.poses for group in counted)) if counted else math.nan
+
+    @property
+    def _counted(self) -> list[LeftOut]:
+        """The groups with poses that the others can predict."""
+        return [group for group in self.groups if group.poses and np.isfinite(group.rms_predicted)]
+
+    @property
+    def distances(self) -> Float[np.ndarray, " m"] | None:
+        """Of the poses that `rms` is of, mm; None where the groups do not have them."""
+        values = [group.distances for group in self._counted if group.distances is not None]
+        if not values or len(values) < len(self._counted):
+            return None
+        pooled = np.concatenate(values)
+        return pooled[np.isfinite(pooled)]
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """Of `rms` at `coverage.LEVEL`, mm, as it scatters between groups; None of a single group."""
+        if (count := len(self._counted)) < 2:
+            return None
+        poses, squares = (np.array([getattr(group, name) for group in self._counted]) for name in ("poses", "rms"))
+        share, squares = poses / poses.sum(), squares**2
+        mean = float(share @ squares)
+        u = math.sqrt(count / (count - 1) * float(np.sum((share * (squares - mean)) ** 2)))
+        half_width = float(student_quantile((1 + LEVEL) / 2, count - 1)) * u
+        return math.sqrt(max(mean - half_width, 0.0)), math.sqrt(mean + half_width)
 
     def between(self, without: int | None = None, *, chosen: bool = False) -> BetweenGroups | None:
         """How the poses of the groups agree with their prediction, or of all but one; None where there are too few.

@@ -57,6 +57,7 @@ class UnseenErrors(NamedTuple):
     """Errors of a calibrated arm on a capture that it was not identified from, found and predicted."""
 
     parts: dict[str, _Part]  # of sockets first, then of other observations
+    distances: dict[str, Float[np.ndarray, " _"]]  # of their poses, mm; NaN for the only pose of a socket
     common: Float[np.ndarray, "w w"]  # covariance of what they share
     length_error: Float[np.ndarray, " l"]  # of the reference lengths, mm
     length_covariance: Float[np.ndarray, "l l"]  # predicted, mm^2
@@ -139,7 +140,8 @@ def unseen_errors(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
     uncertainty, capture = to_numpy((to_numpy(uncertainty).complete, capture))
     problem, freedom = _Unseen.of(uncertainty, capture), uncertainty.scatter_degrees_of_freedom
     parts = {part.observation.name: _part_of(problem, number, part) for number, part in enumerate(problem.parts)}
-    return UnseenErrors(parts, problem.common, *_of_lengths(problem, capture), freedom, uncertainty.between)
+    distances = {part.observation.name: _distances_of(part) for part in problem.parts}
+    return UnseenErrors(parts, distances, problem.common, *_of_lengths(problem, capture), freedom, uncertainty.between)
 
 
 class _Unseen(NamedTuple):
@@ -196,6 +198,12 @@ class _Unseen(NamedTuple):
             private.append(np.asarray(followed(np.asarray(rows), roots, block.sizes)))
         private, joined = observed.by_observation(private), observed.by_observation(joined)
         return cls(uncertainty, linear, influence, linear.parts(), private, joined, common, basis, along, kept)
+
+
+def _distances_of(part: ObservationRows) -> Float[np.ndarray, " m"]:
+    """Of the poses from their geometry, mm; the only pose of a socket shows no scatter."""
+    distances = np.linalg.norm(part.observation.in_mm(np.asarray(part.values), np.asarray(part.by_tip)), axis=0)
+    return np.full(1, np.nan) if part.observation.kind == "socket" and len(distances) == 1 else distances
 
 
 def _part_of(problem: _Unseen, number: int, part: ObservationRows) -> _Part:

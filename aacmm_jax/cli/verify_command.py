@@ -8,6 +8,8 @@ import typer
 
 from .. import files, plot, summaries
 from ..core.errors import InputError
+from ..core.text import common_labels
+from ..files.hdf5 import read_summary
 from ..files.inputs import fingerprint
 from ..files.outputs import together, write_atomically
 from ..summaries.tables import View
@@ -37,12 +39,13 @@ def verify(
     base: str | None = options.BASE_LINK,
     tip: list[str] | None = options.TIP_LINK,
     max_rms_mm: float | None = option(
-        "RMS error of the tip that your task allows: say whether the delivered parameters meet it, and exit with "
-        "code 1 unless they do.",
+        "RMS error of the tip that your task allows: half of what a single pose may err. Say whether the delivered "
+        "parameters meet it, and exit with code 1 unless they do, or the calibrated arm of --calibration.",
         min=0,
     ),
     calibration: Path | None = option(
-        "Calibration of this arm: state its error in held-out poses beside the verdict.", "CALIBRATION.h5"
+        "Calibration of this arm: test the calibrated arm, too, on the held-out poses of its cross-validation.",
+        "CALIBRATION.h5",
     ),
     output: Path | None = output(
         "Page for printing: verdict, picture, numbers, and what was not tested.", "PAGE.html", default=None
@@ -70,7 +73,7 @@ def verify(
     named = None if arm is None or os.path.isfile(str(delivered)) else arm
     if named is not None and named.arm.joints == recording.nominal.arm.joints:
         _refuse_another_robot(recording.nominal, named)
-    held_out = None if calibration is None else _cross_validated(calibration, recording.nominal.name)
+    record = None if calibration is None else _cross_validated(calibration, recording.nominal.name)
     checked = with_spinner("Verifying", lambda: run(recording, arm))
     given, measured = arm or recording.as_found, recording.capture
     summary = summaries.verification.verification_summary(
@@ -79,7 +82,8 @@ def verify(
         delivered or ("" if given is None else given.name),
         scaled=bool(measured.lengths or measured.observations),
         max_rms=max_rms_mm,
-        calibrated=held_out,
+        calibrated=None if calibration is None else _calibrated(calibration, record),
+        lengths=common_labels([(length.start, length.end) for length in measured.lengths]),
     )
     if named is not None and named.name != recording.nominal.name:
         summary["warnings"].append(
@@ -90,7 +94,7 @@ def verify(
 
         files_read = [path for path in (capture, delivered, calibration) if path and os.path.isfile(path)]
         sources = dict.fromkeys([*map(fingerprint, files_read), *recording.sources])
-        write_verification(output, checked, measured, summary, sources=list(sources))
+        write_verification(output, checked, measured, summary, sources=list(sources), calibration=record)
         summary["written"] = str(output)
     show_summary(summary, as_json, summaries.verification.verification)
     if not summary["achieved"]:
@@ -98,7 +102,7 @@ def verify(
 
 
 def _cross_validated(path: Path, arm: str) -> Any:
-    """The cross-validation of a calibration of the arm with this name."""
+    """A calibration of the arm with this name, which has a cross-validation."""
     record = files.load_calibration(path)
     if record.validation is None:
         raise InputError(f"{path} has no cross-validation; calibrate this recording with --cross-validate.")
@@ -107,7 +111,21 @@ def _cross_validated(path: Path, arm: str) -> Any:
             f"{path} is of '{record.recording.nominal.name}', and not of '{arm}', the arm of the recording; give a "
             "calibration of this recording."
         )
-    return record.validation
+    return record
+
+
+def _calibrated(path: Path, record: Any) -> Any:
+    """What is said of a calibration beside the verdict."""
+    from ..kinematics.arm import correction_names
+
+    summary = read_summary(path, ("calibration",))[1] or summaries.calibration.calibration_summary(record)
+    verdict, tested, caution = summary["verdict"], summary.get("lengths_tested"), ""
+    if verdict["mark"] in ("unsure", "bad"):
+        caution = f"{path}: {verdict['says'].partition('. ')[0].rstrip('.')}."
+        if tested:
+            caution += f" Lengths over {tested['longest_mm']:.4g} mm are untested."
+    corrections = bool(correction_names(record.calibrated.arm))
+    return summaries.verification.Calibrated(record.validation, str(path), corrections, caution)
 
 
 def _refuse_another_robot(nominal: Any, arm: Any) -> None:

@@ -111,10 +111,12 @@ def table_of(record: Any, fields: Fields) -> Table:
 
 def rows_table(dimension: str, records: Iterable[Any], fields: Fields) -> Table:
     """The table of many records: a row each, and one after the other what has a dimension of its own. A text that is
-    None is empty, and left out where all are."""
+    None is empty, and left out where all are, as any other field is."""
     records, variables = list(records), {}
     for name, field in fields.items():
         values = [_value(record, name) for record in records]
+        if records and all(value is None for value in values):
+            continue
         if field.content == "text" and not field.dimensions and None in values:
             if not any(values):
                 continue

@@ -182,6 +182,7 @@ LEFT_OUT: Fields = {
     "rms_degrees_of_freedom": number("effective degrees of freedom of rms_predicted", "1"),
     "length_degrees_of_freedom": number("effective degrees of freedom of length_u", "1"),
     "noise_degrees_of_freedom": number("degrees of freedom of the estimated noise", "1"),
+    "distances": number("distance of a held-out pose from its geometry; NaN alone in a socket", "mm", "left_out_pose"),
 }
 
 REMOVED: Fields = {

@@ -202,7 +202,8 @@ def left_out_group(
     poses, lengths = errors.of(errors.parts), errors.of_lengths()
     of_lengths, of_noise = lengths.degrees_of_freedom, errors.noise_degrees_of_freedom
     columns = poses.count, poses.rms, poses.predicted, errors.length_error, errors.length_u, converged
-    return LeftOut(names or names_in(left), *columns, poses.degrees_of_freedom, of_lengths, of_noise)
+    freedom = poses.degrees_of_freedom, of_lengths, of_noise
+    return LeftOut(names or names_in(left), *columns, *freedom, np.concatenate([*errors.distances.values()]))
 
 
 def _check_some_left(pattern: str, some: bool) -> None:

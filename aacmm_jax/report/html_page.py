@@ -10,6 +10,7 @@ from typing import Any
 from ..acceptance.judgement import Rule
 from ..acceptance.procedure import Procedure
 from ..acceptance.record import SIMULATED
+from ..calibration.record import CalibrationRecord
 from ..core.errors import require
 from ..data.capture import Capture
 from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity
@@ -158,6 +159,7 @@ def write_verification(
     summary: dict[str, Any] | None = None,
     *,
     sources: Sequence[str] = (),
+    calibration: CalibrationRecord | None = None,
 ) -> dict[str, Any]:
     """Write what `aacmm_jax.verify` found as one HTML file that prints on one page: the verdict, the distance of every
     pose, the errors, what a calibration would gain, and what was not tested.
@@ -171,6 +173,7 @@ def write_verification(
         capture: The poses.
         summary: What ``aacmm verify --json`` prints; by default without the names of the arm and the parameters.
         sources: Names and digests of the files.
+        calibration: Its held-out poses are drawn, too, if it was identified from this capture.
 
     Example:
         >>> checked = aj.verify(aj.Recording(two_bars, nominal), nominal._replace(arm=true))
@@ -184,7 +187,8 @@ def write_verification(
     shown = verification_summary(checked, "an arm", "stated parameters") if summary is None else summary
     with together(target):
         attributes = provenance("verification") | {"sources": list(sources) or ["none"]}
-        return _written(verification_report(checked, capture, shown), _origin(None, attributes), Path(target))
+        report = verification_report(checked, capture, shown, calibration)
+        return _written(report, _origin(None, attributes), Path(target))
 
 
 def _identity(attributes: dict[str, Any], given: AdministrativeData | None) -> str:

@@ -128,6 +128,8 @@ def test_cross_validation_of_honest_data(arm, bounds, capture):
     # The found RMS rests on 3 x 24 poses in 3 dimensions, the lengths' on three values.
     assert 0.8 < checked.rms / checked.rms_predicted < 1.25
     assert 0.2 < checked.length_rms / checked.length_u < 2.2
+    assert len(checked.distances) == 3 * 24
+    assert np.sqrt(np.mean(checked.distances**2)) == pytest.approx(checked.rms)
 
 
 @pytest.mark.slow
@@ -180,6 +182,26 @@ def test_what_is_surprising(case):
     assert checked.open == (case == "open")
 
 
+def test_the_interval_of_held_out_poses_covers_as_stated():
+    """Mean squares that scatter between groups, as independent ones do; of one group there is no interval."""
+    random, covered, trials = np.random.default_rng(0), 0, 2000
+    for _ in range(trials):
+        groups = [left_out(np.sqrt(1 + 0.2 * random.normal()), [], [], poses=20) for _ in range(4)]
+        low, high = CrossValidation(tuple(groups)).interval
+        covered += low < 1.0 < high
+    assert covered / trials == pytest.approx(0.95, abs=2 * np.sqrt(0.95 * 0.05 / trials))
+    assert CrossValidation(tuple(groups[:1])).interval is None
+
+
+def test_held_out_poses_are_those_that_count():
+    """Without groups that the others cannot predict, and without the only poses of sockets."""
+    known, alone = np.array([0.3, 0.4]), np.array([np.nan, 0.5])
+    groups = [left_out(0.1, [], [])._replace(distances=values) for values in (known, alone, np.ones(3))]
+    groups[2] = groups[2]._replace(rms_predicted=np.inf)
+    assert CrossValidation(tuple(groups)).distances.tolist() == [0.3, 0.4, 0.5]
+    assert CrossValidation((groups[0], groups[1]._replace(distances=None))).distances is None
+
+
 @pytest.mark.slow
 def test_one_placement_cannot_be_cross_validated(arm, bounds, capture):
     alone = capture.select(only=["0/*"])
@@ -222,6 +244,7 @@ def test_files_keep_all_of_it(arm, bounds, capture, tmp_path):
         assert found.sockets == kept.sockets
         assert (found.rms, found.rms_predicted, found.converged) == (kept.rms, kept.rms_predicted, kept.converged)
         np.testing.assert_array_equal(found.length_error, kept.length_error)
+        np.testing.assert_array_equal(found.distances, kept.distances)
     np.testing.assert_array_equal(loaded.sampled["high"], sampled.high)
     assert loaded.sampled_says == "It agrees."
     # A calibration that failed leaves residuals of any size; its file is read all the same.

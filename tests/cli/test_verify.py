@@ -89,11 +89,21 @@ def test_the_held_out_result_of_a_calibration_stands_beside_the_verdict(aacmm, r
     summary = json.loads(aacmm(*options, "c.h5", "-o", "page.html", "--json", expect=1).stdout)
     known = json.loads(aacmm("show", "c.h5", "--json").stdout)["cross_validation"]
     assert (summary["calibrated"]["rms_mm"], summary["calibrated"]["groups"]) == (known["rms_mm"], known["groups"])
-    says = f"Calibrated: {known['rms_mm']:.3g} mm RMS in held-out poses (3 groups, each held out once"
-    page = " ".join((robot / "page.html").read_text("utf-8").split())
+    page, says = " ".join((robot / "page.html").read_text("utf-8").split()), "Held-out poses: 3 groups, each held out"
+    assert summary["says"].startswith("Not good: ")
+    assert f"Calibrated: {known['rms_mm']:.3g} mm RMS (95 %: " in summary["says"]
+    assert "would" not in summary["says"]
     assert says in summary["calibrated"]["says"]
-    assert says in page
-    assert "Calibrated, held-out poses" in page
+    for text in (says, "Calibrated, held-out poses", "Of the calibrated arm: each pose when it was held out"):
+        assert text in page
+    assert "Tested as delivered: the published nominal parameters, not what your controller computes." in page
+    good = json.loads(aacmm(*options, "c.h5", "--max-rms-mm", "1", "--json").stdout)
+    assert good["says"].startswith("Calibrated, good enough for 1 mm RMS: ")
+    assert (good["calibrated"]["poses"], good["calibrated"]["beyond"]) == (good["poses"], 0)
+    assert good["calibrated"]["largest_mm"] > good["calibrated"]["rms_mm"] > good["calibrated"]["lower_mm"]
+    shown = json.loads(aacmm("show", "c.h5", "--json").stdout)
+    assert ("To be used with care" in shown["verdict"]["says"]) == ("To be used with care" in good["warnings"][-1])
+    assert f"Lengths over {shown['lengths_tested']['longest_mm']:.4g} mm are untested." in good["warnings"][-1]
     other = aacmm("verify", "poses.toml", "--delivered", "nominal.toml", "--calibration", "c.h5", expect=2)
     assert "and not of 'nominal', the arm of the recording" in " ".join(other.stderr.split())
     aacmm("calibrate", recorded, "-o", "plain.h5", "--model", "dh", "--no-cross-validate")

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.calibration.agreement import CrossValidation, LeftOut
 from aacmm_jax.kinematics.parameters import ArmSpecification
-from aacmm_jax.pipeline.verification import MARGIN, _paired, _Rows
-from aacmm_jax.summaries.verification import verification, verification_summary
+from aacmm_jax.pipeline.verification import MARGIN, Accuracy, Verification, _paired, _Rows
+from aacmm_jax.summaries.verification import Calibrated, mark_of, verification, verification_summary
 
 PROBE = np.array([20.0, -40.0, 120.0])
 NAMES = tuple(f"{kind}_{i}" for kind in ("a", "d", "theta", "alpha") for i in range(1, 7))
@@ -136,7 +137,7 @@ def test_the_same_parameters_are_compared_with_a_calibration():
         judged = verification_summary(bad, "", "", max_rms=limit)
         assert (judged["enough"], judged["achieved"], judged["do"]) == (enough, enough == "yes", does)
         beyond = int((bad.distances[1] > limit).sum())
-        assert f"ood enough for {limit:g} mm RMS: {beyond} of 24 poses beyond it" in judged["says"]
+        assert f"ood enough for {limit:g} mm RMS: {beyond} of 24 poses beyond {limit:g} mm" in judged["says"]
     between = verification_summary(bad, "", "", max_rms=(low + high) / 2)
     assert (between["enough"], between["achieved"]) == ("not decided", False)
 
@@ -156,6 +157,82 @@ def test_the_uncertainty_of_a_length_counts_in_what_a_calibration_would_leave():
     reach = [np.sqrt(found**2 - known**2) / (u / 100) for found, u in zip(uncertain, (0.05, 0.1), strict=True)]
     assert 250 < min(reach) < max(reach) < 600
     assert left(20.0) == pytest.approx(left(), rel=0.02)
+
+
+def of_nominal_parameters(rms: float) -> Verification:
+    """Of 4 poses, by the nominal parameters, which were delivered; a calibration would leave 0.1 mm."""
+    found = Accuracy(rms, 0.9 * rms, 1.1 * rms, 100.0)
+    distances = np.full((2, 4), rms)
+    return Verification(
+        *("not good", found, found, 0.5, 0.0, 1.0, 1.0, 4, 13, 6, None, np.array([[0.2], [0.2]]), distances),
+        *(rms, 0.1, 1.0, 1.0, "not decided", True),
+    )
+
+
+def calibrated_at(rms: float, spread: float, corrections: bool = False) -> Calibrated:
+    """Two held-out groups of two poses each; the first errs less than the second by twice the spread."""
+    groups = []
+    for name, size in (("A", rms - spread), ("B", rms + spread)):
+        distances = np.array([0.8, np.sqrt(2 - 0.8**2)]) * size
+        group = LeftOut((name,), 2, size, size, np.zeros(0), np.zeros(0), True, distances=distances)
+        groups.append(group)
+    return Calibrated(CrossValidation(tuple(groups)), "c.h5", corrections, "c.h5: To be used with care.")
+
+
+def test_the_calibrated_arm_gets_a_verdict_of_its_own():
+    """As found by a reader: beside a tested calibration, one was predicted, and the task was to calibrate."""
+    checked, calibration = of_nominal_parameters(3.0), calibrated_at(0.2, 0.001)
+    low, high = calibration.validation.interval
+    summary = verification_summary(checked, "arm", "arm", max_rms=1.0, calibrated=calibration, lengths=["left"])
+    assert summary["says"] == (
+        f"Calibrated, good enough for 1 mm RMS: 0.2 mm RMS (95 %: {low:.3g} to {high:.3g} mm) in held-out poses, "
+        "0 of 4 beyond 1 mm, largest error 0.234 mm. As delivered, not good enough: 3 mm RMS (95 %: 2.7 to 3.3 mm) "
+        "with the tip fitted, 4 of 4 beyond 1 mm."
+    )
+    assert (summary["enough"], summary["calibrated"]["enough"], summary["do"]) == ("no", "yes", "use the calibration")
+    assert (summary["achieved"], mark_of(summary)) == (True, "good")
+    assert (summary["calibrated"]["beyond"], summary["calibrated"]["poses"]) == (0, 4)
+    said = " ".join(map(str, verification(summary)))
+    assert not any(text in said for text in ("come on top", "at least", "would", "To do: calibrate"))
+    for text in ("aacmm correct c.h5", "not what your controller computes", "To be used with care", "left 0.200"):
+        assert text in said
+    assert "of a calibration with --model dh" not in said
+    corrected = verification_summary(checked, "", "", max_rms=1.0, calibrated=calibrated_at(0.2, 0.001, True))
+    assert "of a calibration with --model dh" in corrected["next"]
+
+
+@pytest.mark.parametrize(
+    ("delivered", "rms", "spread", "enough", "begins", "does"),
+    [
+        (3.0, 2.0, 0.01, "no", "Calibrated, not good", "find the cause of the remaining errors"),
+        (3.0, 0.9, 0.1, "not decided", "Calibrated, not decided", "record more poses in other places"),
+        (0.5, 2.0, 0.01, "no", "As delivered, good enough", "keep the parameters"),
+    ],
+)
+def test_verdicts_on_the_calibrated_arm(delivered, rms, spread, enough, begins, does):
+    calibration = calibrated_at(rms, spread)
+    summary = verification_summary(of_nominal_parameters(delivered), "", "", max_rms=1.0, calibrated=calibration)
+    assert summary["calibrated"]["enough"] == enough
+    assert summary["says"].startswith(begins)
+    assert (summary["do"], summary["achieved"]) == (does, delivered < 1)
+    if enough == "no":
+        assert "4 of 4 beyond 1 mm" in calibration.says(1.0)
+
+
+def test_a_calibration_without_a_limit_and_without_single_poses():
+    """Of a file of an earlier version, or a single group, less is said."""
+    calibration = calibrated_at(0.2, 0.001)
+    summary = verification_summary(of_nominal_parameters(3.0), "", "", calibrated=calibration)
+    assert summary["says"].startswith("Not good: 3 mm RMS")
+    assert "calibration with these poses" not in summary["says"]
+    assert summary["do"] == "use the calibration"
+    group = calibration.validation.groups[0]._replace(distances=None)
+    one = calibration._replace(validation=CrossValidation((group,)))
+    summary = verification_summary(of_nominal_parameters(3.0), "", "", max_rms=1.0, calibrated=one)
+    assert summary["says"].startswith("Calibrated, good enough for 1 mm RMS: 0.199 mm RMS in held-out poses. As del")
+    assert (summary["calibrated"]["beyond"], summary["calibrated"]["upper_mm"]) == (None, None)
+    worse = verification_summary(of_nominal_parameters(0.25), "", "", calibrated=calibration)
+    assert worse["do"] == "keep the parameters"
 
 
 def drawn(random: np.random.Generator, share: float, clusters: int = 12) -> tuple[_Rows, _Rows]:
