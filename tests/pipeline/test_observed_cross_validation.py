@@ -117,6 +117,7 @@ def test_some_poses_of_an_observation(paper_arm, kind):
     np.testing.assert_allclose(part.normalised[0], np.asarray(whole.normalised[0])[:, poses], rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_errors_of_the_nominal_arm_are_those_that_the_calibrated_one_has_by_the_same_rule(paper_arm, true, bounds):
     points = {"A": (400, 200, 300), "B": (500, 300, 100)}
     used = aj.simulate(true, points, poses=25, lengths=[("A", "B", 0.001)], noise=NOISE, seed=5)
