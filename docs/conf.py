@@ -4,7 +4,8 @@ Snippets of the pages are run by tests/docs/test_pages.py, each page by itself, 
 
 * ```` ```python ````: the blocks of a page are one program.
 * ```` ```console ````: each line that begins with ``$ aacmm`` is run in a temporary folder that contains `examples`;
-  the lines after it show what it prints, and are compared on the pages that the test names.
+  the lines after it show what it prints, and are compared on the pages that the test names. After a line
+  ``$ cd examples/NAME``, the folder contains the files of that example, too.
 * ```` ```toml ```` after a line ``<!-- file: name.toml -->``: written to that file of the temporary folder first.
 * ```` ```text ````, ```` ```bash ````, other ```` ```toml ````, and any block after a line
   ``<!-- not run: reason -->``: not run.

@@ -67,6 +67,7 @@ class LeftOut(NamedTuple):
     rms_degrees_of_freedom: float = math.nan
     length_degrees_of_freedom: float = math.nan
     noise_degrees_of_freedom: float = math.inf
+    rms_nominal: float | None = None  # distance by the nominal arm, with the geometry fitted to it likewise
     distances: Float[np.ndarray, " m"] | None = None  # of its poses; NaN alone in a socket; None: of an earlier file
 
     @property
@@ -133,6 +134,11 @@ class CrossValidation(NamedTuple):
     def rms_predicted(self) -> float:
         """What the uncertainties of the calibrations without them predicted, mm."""
         return self._pooled("rms_predicted")
+
+    @property
+    def rms_nominal(self) -> float:
+        """The same distance by the nominal arm, mm; NaN where it is not known."""
+        return self._pooled("rms_nominal") if all(group.rms_nominal is not None for group in self.groups) else math.nan
 
     @property
     def length_rms(self) -> float:

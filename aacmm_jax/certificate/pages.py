@@ -79,7 +79,7 @@ def _address(contact: Element, words: Language) -> list[str]:
     place = first(contact, "dcc:location")
     part = {key: place.findtext(f"dcc:{key}", "", PREFIXES) for key in ("street", "postCode", "city", "countryCode")}
     city = " ".join(filter(None, (part["postCode"], part["city"])))
-    lines = [part["street"], city, part["countryCode"]]
+    lines = [part["street"], city, part["countryCode"] if city else ""]  # a code alone is not an address
     reached = (contact.findtext(f"dcc:{key}", "", PREFIXES) for key in ("eMail", "phone"))
     name = words.stated(content(contact, "dcc:name"))
     return [name, *filter(None, (", ".join(filter(None, lines)), ", ".join(filter(None, reached))))]

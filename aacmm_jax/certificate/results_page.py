@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 from xml.etree.ElementTree import Element
 
-from .conformity import STAGES, limit_of, stage_before, tests_of
+from .conformity import BASED_ON, STAGES, lacking_of, limit_of, says_of, stage_before, tests_of
 from .languages import Language
 from .sections import (
     MOST_ROWS,
@@ -25,7 +25,7 @@ from .sections import (
 from .xml_elements import LEFT_OUT_NAMES, PREFIXES
 
 _MOST_FINDINGS, _MOST_JOINTS = 4, 8  # the certificate has two pages
-_MOST_CHARACTERS, _MOST_MISSING = 280, 130  # of a finding, and of what a procedure lacks
+_MOST_CHARACTERS = 280  # of a finding
 _COLUMNS = ("alpha", "a", "d", "theta", "beta")
 # Of verdicts, the worst first.
 _VERDICTS = ("fail", "conditionalFail", "conditionalPass", "pass")
@@ -43,10 +43,12 @@ def results_page(results: dict[str, Element], statements: dict, words: Language)
     yield from _parameters(stages[1], words("parameters"), words)
     yield from _parameters(stages[0], words("parameters_before", before=words(before)), words)
     tests = [tests_of(results, stage) for stage in (before, "after")]
-    u_test = _u_test(results.get(f"Acceptance tests, {STAGES['after']}"), words)
+    tested = results.get(f"Acceptance tests, {STAGES['after']}")
+    u_test = _u_test(tested, words)
+    unused = content(tested, "dcc:description").endswith("not used for the calibration.")
     called = dict.fromkeys(name.partition(": ")[0] for name in tests[1])
     for standard in called:
-        yield _tests(standard, tests[0], tests[1], before, u_test, words)
+        yield _tests(standard, tests[0], tests[1], before, u_test, words, unused=unused)
         u_test = ""  # said once
     yield from _findings(statements, words)
 
@@ -205,18 +207,22 @@ def _parameters(stage: dict[str, Element], title: str, words: Language) -> Itera
 
 
 def _tests(
-    standard: str, earlier: dict[str, Element], tests: dict[str, Element], before: str, u_test: str, words: Language
+    standard: str,
+    earlier: dict[str, Element],
+    tests: dict[str, Element],
+    before: str,
+    u_test: str,
+    words: Language,
+    *,
+    unused: bool,
 ) -> Section:
     """The worst value of each metric of the tests by a standard, whose names are "standard: title"."""
-    edition = standard.removeprefix("based on ")
+    edition = standard.removeprefix(BASED_ON)
     incomplete = edition != standard
-    rows, factors, missing = [], {}, {}
+    rows, factors = [], {}
     for name, test in tests.items():
         first = named_in(earlier.get(name), "dcc:data/dcc:list")
         metrics = named_in(test, "dcc:data/dcc:list") if name.partition(": ")[0] == standard else {}
-        if metrics:
-            lacking = content(test, "dcc:description").partition("not carried out. ")[2]
-            missing |= {lacking.partition(" Expanded uncertainties")[0]: None}
         for symbol, metric in metrics.items():
             worst = _worst(metric.findall("dcc:quantity", PREFIXES))
             was = _worst(first[symbol].findall("dcc:quantity", PREFIXES)) if symbol in first else None
@@ -229,16 +235,16 @@ def _tests(
                 words.number(expanded),
                 words.number(shortened(limit)),
             ]
-            says = words("metric_" + re.split("[.:]", symbol)[0])
-            rows.append([symbol, says, *numbers, words(verdict) if verdict else "–"])
+            rows.append([symbol, says_of(symbol, words), *numbers, words(verdict) if verdict else "–"])
     factor = words.number(next(iter(factors), "2"))
     sentences = [words("tests_sentence", factor=factor, u=u_test)] if u_test else []
     if incomplete:
-        lacking = words.translated(" ".join(missing))
-        sentences.append(words("incomplete_sentence", standard=edition))
-        sentences.append(lacking if 0 < len(lacking) <= _MOST_MISSING else words("missing_sentence"))
+        sentences += [words("incomplete_sentence", standard=edition), lacking_of(standard, tests, words)]
     return Section(
-        words("tests", standard=words("based_on", standard=edition) if incomplete else edition),
+        words(
+            "tests_unused" if unused else "tests_used",
+            standard=words("based_on", standard=edition) if incomplete else edition,
+        ),
         headings=[words("quantity"), "", words(before), words("after"), "U", words("limit"), words("decision")],
         table=rows,
         texts=2,

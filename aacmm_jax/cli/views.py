@@ -128,7 +128,9 @@ def calibration(summary: dict[str, Any]) -> View:
         yield words.lengths_sentence(summary["lengths_tested"])
     if "held_out_poses" in summary:
         yield words.held_out_sentence(summary["held_out_poses"]["held_out"])
-    yield from words.decided_of(summary["decisions"], summary["cross_validation"] is not None)
+    elif (validated := summary["cross_validation"]) is not None and validated["rms_mm"] is not None:
+        yield words.cross_validated_sentence(validated)
+    yield from words.decided_of(summary)
     if summary["masses"]:
         yield summary["masses"]
     anchor = f"scale anchor {summary['hold']}" if summary["hold"] else "no scale anchor"

@@ -176,6 +176,7 @@ LEFT_OUT: Fields = {
     "poses": count("number of held-out poses in sockets with more than one pose"),
     "rms": number("RMS distance from the centroid, observed", "mm"),
     "rms_predicted": number("RMS distance from the centroid, predicted", "mm"),
+    "rms_nominal": number("RMS distance from the centroid by the nominal arm", "mm"),
     "length_error": number("error of a reference length that was held out", "mm", "left_out_length"),
     "length_u": number("predicted standard uncertainty of length_error", "mm", "left_out_length"),
     "converged": truth("whether the calibration from all other groups converged"),

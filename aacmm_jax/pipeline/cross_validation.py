@@ -13,9 +13,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..calibration.agreement import CrossValidation, LeftOut
+from ..calibration.evaluation import evaluate, fit_geometry
+from ..calibration.pose_table import noise_of_poses
 from ..calibration.prediction import unseen_errors
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.scale_anchor import fixes_scale
+from ..calibration.task import without_lengths
 from ..core.arguments import checked_arguments, items_of, with_options
 from ..core.blas_threads import one_blas_thread
 from ..core.errors import InputError
@@ -23,7 +26,9 @@ from ..core.linear_algebra import inverse_cholesky
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import common_labels
 from ..data.capture import Capture, names_in, part_of
+from ..data.noise import Noise
 from ..diagnostics.equations import Equations, equations_of
+from ..diagnostics.pose_residuals import distances_of, rms
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds
 from ..model.observed import Observed
@@ -190,20 +195,38 @@ def cross_validate(
     left_out = []
     for rest, left, names in parts:
         result = calibrate(arm, rest, bounds, **given._asdict())
-        left_out.append(left_out_group(uncertainty_of(to_numpy(result)), left, bool(result.converged), names))
+        left_out.append(left_out_group(uncertainty_of(to_numpy(result)), left, bool(result.converged), names, arm))
     return CrossValidation(tuple(left_out))
 
 
 def left_out_group(
-    uncertainty: Uncertainty, left: Capture, converged: bool, names: tuple[str, ...] | None = None
+    uncertainty: Uncertainty,
+    left: Capture,
+    converged: bool,
+    names: tuple[str, ...] | None = None,
+    nominal: Arm | None = None,
 ) -> LeftOut:
-    """How a calibrated arm agrees with a capture that it was not identified from, under its names or others."""
+    """How a calibrated arm, and the nominal one, agree with a capture that the arm was not identified from, under its
+    names or others."""
     errors = unseen_errors(uncertainty, left)
     poses, lengths = errors.of(errors.parts), errors.of_lengths()
     of_lengths, of_noise = lengths.degrees_of_freedom, errors.noise_degrees_of_freedom
     columns = poses.count, poses.rms, poses.predicted, errors.length_error, errors.length_u, converged
-    freedom = poses.degrees_of_freedom, of_lengths, of_noise
-    return LeftOut(names or names_in(left), *columns, *freedom, np.concatenate([*errors.distances.values()]))
+    by_nominal = None if nominal is None else rms_by(nominal, left, noise_of_poses(uncertainty))
+    freedom, distances = (poses.degrees_of_freedom, of_lengths, of_noise), np.concatenate([*errors.distances.values()])
+    return LeftOut(names or names_in(left), *columns, *freedom, by_nominal, distances)
+
+
+def rms_by(arm: Arm, left: Capture, noise: Noise) -> float | None:
+    """RMS distance of poses from the geometry that fits an arm best in them, mm, without sockets of one pose; None
+    where there is no other."""
+    arm, left = to_numpy((arm, without_lengths(left)))
+    observed = to_numpy(Observed.of(left, arm))
+    fitted = observed.split(np.asarray(fit_geometry(arm, observed, {}, noise).geometry))
+    by_part = zip((*left.sizes, *(len(o.q) for o in left.observations)),
+                  distances_of(left, evaluate(arm, left, geometry=fitted)), strict=True)  # fmt: skip
+    counted = [distances for i, (poses, distances) in enumerate(by_part) if poses > 1 or i >= len(left.sizes)]
+    return rms(np.concatenate(counted)) if counted else None
 
 
 def _check_some_left(pattern: str, some: bool) -> None:

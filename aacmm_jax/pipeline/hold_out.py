@@ -99,7 +99,8 @@ def tested(record: CalibrationRecord, capture: Capture, masks: Masks) -> Calibra
     record = record._replace(held_out=rows, held_out_nominal=by_nominal)
     if record.validation is not None or any(0 < np.sum(mask) < len(mask) for mask in masks.values()):
         return record
-    group = left_out_group(uncertainty, _where(capture, masks), record.converged)
+    nominal = record.recording.nominal.arm
+    group = left_out_group(uncertainty, _where(capture, masks), record.converged, nominal=nominal)
     return record._replace(validation=CrossValidation((group,)))
 
 

@@ -146,7 +146,7 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
         introduction += (
             f" Poses alone do not determine the scale, so {record.hold} was held constant in stage 1 (scale anchor)."
         )
-    blocks: list[Block] = [introduction, *decided_of(record.decisions, summary["cross_validation"] is not None)]
+    blocks: list[Block] = [introduction, *decided_of(summary)]
     if capture.names or not capture.observations:
         sockets = zip(capture.names, capture.sizes, strict=True)
         columns = {"socket": lambda row: row[0], "poses": lambda row: row[1]}

@@ -301,10 +301,12 @@ def cross_validation_summary(validation: CrossValidation, of_sockets: bool = Tru
     for i, (label, group, chance) in enumerate(zip(validation.labels, validation.groups, chances, strict=True)):
         error, u = (rms(values) for values in (group.length_error, group.length_u))
         names = {"members": "sockets", "rms_mm": "rms", "rms_predicted_mm": "rms_predicted"}
+        names |= {"rms_nominal_mm": "rms_nominal"}
         row = {"group": label, **attributes(group, "poses", "converged", **names), "lengths": len(group.length_error)}
         row |= {"length_error_rms_mm": plain(error), "length_u_mm": plain(u)}
         rows.append(row | {"probability": plain(chance), "disagrees": i in validation.disagreeing})
     names = {"rms_mm": "rms", "rms_predicted_mm": "rms_predicted", "length_error_rms_mm": "length_rms"}
+    names |= {"rms_nominal_mm": "rms_nominal"}
     by_chance = sorted(rows, key=lambda row: 2.0 if row["probability"] is None else row["probability"])
     return {
         "groups": len(rows),

@@ -72,14 +72,21 @@ def validation_tables(summary: Row) -> list[Table]:
     """Cross-validation, pooled and group by group, the most improbable group first."""
     sockets = "socket's centroid or " if summary["of_sockets"] else ""
     pooled = [
-        (f"RMS distance of poses from their {sockets}geometry", "rms_mm", "rms_predicted_mm"),
-        ("RMS error of reference lengths", "length_error_rms_mm", "length_u_mm"),
+        (f"RMS distance of poses from their {sockets}geometry", "rms_mm", "rms_predicted_mm", "rms_nominal_mm"),
+        ("RMS error of reference lengths", "length_error_rms_mm", "length_u_mm", ""),
     ]
-    cells = [(title, summary[value], summary[u]) for title, value, u in pooled if summary[value] is not None]
+    cells = [
+        (title, summary.get(nominal), summary[value], summary[u])
+        for title, value, u, nominal in pooled
+        if summary[value] is not None
+    ]
     caption = f"Cross-validation: each of {summary['groups']} groups held out once, with its {_REFITTED}"
     if summary["groups"] == 1:
         caption = f"The group held out, with its {_REFITTED}"
-    shown = [listed(caption, cells, ("", "residual", "predicted by u"))]
+    heads = ("", "nominal arm", "calibrated arm", "predicted by u")
+    if all(nominal is None for _, nominal, *_ in cells):
+        cells, heads = [(title, *rest) for title, _, *rest in cells], (heads[0], *heads[2:])
+    shown = [listed(caption, cells, heads)]
     rows = summary.get("left_out") or []
     if rows:
         lengths = any(row["lengths"] for row in rows)

@@ -171,15 +171,16 @@ def warnings_of(summary: Mapping[str, Any], lead: str = "Warning:", key: str = "
     return [[Styled(lead, "yellow"), f" {warning}"] for warning in summary.get(key, ())]
 
 
-def decided_of(decisions: Iterable[str], cross_validated: bool) -> Iterator[str]:
-    """What was decided by default; and of the choice of a model, how its figures differ from a cross-validation."""
-    for decision in decisions:
+def decided_of(summary: Mapping[str, Any]) -> Iterator[str]:
+    """What was decided by default; and of the choice of a model, which figure to state instead of those it names."""
+    stated = "line Held out" if "held_out_poses" in summary else "table Cross-validation"
+    for decision in summary["decisions"]:
         yield f"Decided by default: {decision}"
-        if cross_validated and decision.startswith(MODEL_CHOSEN):
+        if summary["cross_validation"] is not None and decision.startswith(MODEL_CHOSEN):
             yield (
                 "These figures of held-out regions only compare models: a region is one group, or half of a joint's "
                 "travel, and a frame or target that other poses share is not fitted to it again. State the figure of "
-                "the table Cross-validation."
+                f"the {stated}."
             )
 
 
@@ -311,6 +312,16 @@ def held_out_sentence(row: Mapping[str, Any]) -> str:
     return (
         f"Held out: {pluralise(row['poses'], 'pose')}; RMS distance from their geometry, as the other poses determine "
         f"it, {found}{predicted and f' (predicted {predicted})'}, largest {row['largest_mm']:.3g} mm."
+    )
+
+
+def cross_validated_sentence(row: Mapping[str, Any]) -> str:
+    """What a cross-validation says of a calibration (`calibration.cross_validation_summary`), in words."""
+    before, after, predicted = (row[key] for key in ("rms_nominal_mm", "rms_mm", "rms_predicted_mm"))
+    found = f"{after:#.3g} mm calibrated" if before is None else f"{before:#.3g} mm nominal, {after:#.3g} mm calibrated"
+    return (
+        f"Cross-validation: each of {row['groups']} groups held out once; RMS distance of poses from their geometry, "
+        f"fitted to them again, {found} (predicted {predicted:#.3g} mm)."
     )
 
 

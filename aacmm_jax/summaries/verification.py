@@ -125,17 +125,18 @@ _NOT_TESTED = (
 
 def _held_out(calibrated: Calibrated, limit: float | None, meets: str | None) -> dict[str, Any]:
     """The error of a calibration in poses that it had not used."""
-    validation, distances = calibrated.validation, calibrated.validation.distances
+    validation, found = calibrated.validation, calibrated.validation.distances
+    distances = None if found is None or not len(found) else found
     low, high = validation.interval or (None, None)
-    groups, known = pluralise(len(validation.groups), "group"), distances is not None and len(distances) > 0
+    groups = pluralise(len(validation.groups), "group")
     return {
         "rms_mm": validation.rms,
         "lower_mm": low,
         "upper_mm": high,
         "groups": len(validation.groups),
-        "poses": len(distances) if known else None,
-        "beyond": int((distances > limit).sum()) if known and limit is not None else None,
-        "largest_mm": float(distances.max()) if known else None,
+        "poses": None if distances is None else len(distances),
+        "beyond": None if distances is None or limit is None else int((distances > limit).sum()),
+        "largest_mm": None if distances is None else float(distances.max()),
         "enough": meets,
         "of_poses": "; ".join(["RMS", *_of_poses(distances, limit)]),
         "says": f"Held-out poses: {groups}, each held out once, with its sockets and frames fitted again.",

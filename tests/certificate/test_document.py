@@ -304,13 +304,14 @@ def test_a_conformity_rests_on_results(record, full, evaluation):
 @pytest.mark.parametrize(
     ("before", "limit", "english", "german"),
     [
-        ("nominal", 0.5, "; with the nominal parameters, the arm fails (Deltam)", "; mit den Nennparametern hält"),
-        ("as_found", 0.5, "; with the parameters as found, the arm fails (Deltam)", "; mit den Parametern bei Eingang"),
+        ("nominal", 0.5, "; with the nominal parameters, the arm fails ({})", "; mit den Nennparametern hält"),
+        ("as_found", 0.5, "; with the parameters as found, the arm fails ({})", "; mit den Parametern bei Eingang"),
         ("nominal", 50.0, "", ""),
     ],
 )
 def test_conformity_is_of_the_calibrated_parameters(record, full, evaluation, before, limit, english, german):
-    """And where the arm fails with those before, this is stated as well."""
+    """And where the arm fails with those before, this is stated as well. Printed metrics have their words beside
+    them."""
     as_found = record.recording.nominal if before == "as_found" else None
     record, evaluation = (x._replace(recording=x.recording._replace(as_found=as_found)) for x in (record, evaluation))
     evaluation = evaluation._replace(limits={"Deltam": aj.acceptance.Limit(limit)})
@@ -322,22 +323,39 @@ def test_conformity_is_of_the_calibrated_parameters(record, full, evaluation, be
     assert dcc_model.faults(dcc) == []
     (says,) = [x for x in contents(dcc, "*/dcc:statements") if x.startswith("The statement of conformity holds")]
     assert (
-        says.endswith(english[2:].replace("with", "With") + ".")
+        says.endswith(english[2:].replace("with", "With").format("Deltam") + ".")
         if english
         else says.endswith("parameters loaded into it.")
     )
+    deltam = {
+        "en": "largest half range of a coordinate in a socket",
+        "de": "größte halbe Spannweite einer Koordinate",
+    }
+    decimal = {"en": ".", "de": ","}
+    procedure = {
+        "en": ("Test procedure", "based on JJF 1408-2013, not carried out in full: 30 different positions are required "
+               "(1 given)"),
+        "de": ("Prüfverfahren", "in Anlehnung an JJF 1408-2013, nicht vollständig durchgeführt: Gefordert sind 30 "
+               "verschiedene Orte (vorhanden: 1)"),
+    }  # fmt: skip
     for language, begins, fails, loaded in (
-        ("en", "conforms, with the c", english, "with the calibrated parameters of this certificate loaded into it"),
+        (
+            "en",
+            "conforms, with the c",
+            english.format(deltam["en"]),
+            "with the calibrated parameters of this certificate loaded into it",
+        ),
         ("de", "konform, mit den k", german, "wenn die kalibrierten Parameter dieses Kalibrierscheins in ihm geladen"),
     ):
-        # On the first page, behind the identification; first the verdict, then what it is about, rule and limits.
+        # On the first page, behind the identification; verdict, specification, rule, limits, procedure.
         (identified, section, *_), _ = printed_certificate(dcc, language=language).pages.pages
         assert identified.title.startswith("Identifi")
         (key, text), *about = section.facts
         assert key in ("Statement of conformity", "Konformitätsaussage")
         assert about[0] == ({"en": "Specification", "de": "Spezifikation"}[language], "S")
         assert about[1][1].startswith("ISO 14253-1:2017")
-        assert about[2][1].startswith("Deltam")
+        assert about[2][1].startswith(f"Deltam, {deltam[language]}: {limit:g}".replace(".", decimal[language]))
+        assert about[3] == procedure[language]
         assert loaded in section.paragraphs[0]
         assert text.startswith(begins)
         assert fails in text

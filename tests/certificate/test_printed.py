@@ -105,8 +105,46 @@ def test_limits_without_a_statement_are_none(record, full, evaluation):
     about = full.model_copy(update={"conformity": None})
     dcc = aj.certificate.dcc_xml(record, about, created=CREATED, evaluation=evaluation)
     (_, conformity, *_), _ = printed_certificate(dcc).pages.pages
-    assert [key for key, _ in conformity.facts] == ["Decision rule", "Limits of the evaluation"]
+    assert [key for key, _ in conformity.facts] == ["Decision rule", "Limits of the evaluation", "Test procedure"]
     assert conformity.paragraphs == ["No statement of conformity is made."]
+
+
+@pytest.mark.slow
+def test_results_say_which_data_they_are_from(certificates):
+    """Repeatability is of the poses of the calibration; a test, as its evaluation says."""
+    dcc, other = certificates["all stated"], "also used for the calibration, because there are no other poses."
+    for language, repeatability, unused, used in (
+        ("en", "Repeatability in the sockets of the calibration", "in poses that were not used: ", "in poses of the "),
+        ("de", "Wiederholbarkeit in den Kugelaufnahmen der Kalibrierung", "in nicht verwendeten Stellungen: ", "der K"),
+    ):
+        for text, words in ((dcc, unused), (dcc.replace("not used for the calibration.", other), used)):
+            titles = [section.title for section in printed_certificate(text, language=language).pages.pages[1]]
+            assert titles[0] == f"{repeatability} [mm]"
+            (of_jjf,) = [title for title in titles if "JJF" in title]
+            assert words in of_jjf
+
+
+@pytest.mark.slow
+def test_uncertainties_say_what_they_include(certificates):
+    """Of the tip, the calibration alone; of a length, the noise as well."""
+    for language, tip, length in (
+        ("en", "contribution of the calibration", "with the noise of both readings"),
+        ("de", "Beitrag der Kalibrierung", "mit dem Rauschen beider Ablesungen"),
+    ):
+        pages = printed_certificate(certificates["all stated"], language=language).pages.pages
+        (rows,) = [section.table for section in pages[1] if "U (95" in section.title]
+        assert {row[0].rpartition(": ")[2] for row in rows[::2]} == {tip}
+        assert {row[0].rpartition(": ")[2] for row in rows[1::2]} == {length}
+
+
+@pytest.mark.slow
+def test_a_country_code_is_not_printed_without_a_city(record):
+    city = aj.files.AdministrativeData(
+        laboratory={"name": "L", "city": "O", "country": "FR"}, customer={"country": "DE"}
+    )
+    pages = printed_certificate(aj.certificate.dcc_xml(record, city, created=CREATED)).pages
+    assert pages.laboratory == ["L", "O, FR"]
+    assert "DE" not in dict(pages.pages[0][0].facts).get("Customer", "")
 
 
 @pytest.mark.slow
@@ -149,7 +187,9 @@ def test_what_a_laboratory_states_is_printed(certificates):
     page = printed_certificate(certificates["all stated"], language="de").html()
     texts = Texts(page).texts
     rule = "ISO 14253-1:2017, Konformität mit einer Wahrscheinlichkeit von 95\u00a0% nachgewiesen"
-    decided = f"{rule}; passes where |E| + U is below 0.05 mm", "Deltam\u00a05,0\u00a0mm; E_Uni\u00a00,05\u00a0mm"
+    deltam, e_uni = "größte halbe Spannweite einer Koordinate", "Längenmessabweichung, einseitig"
+    limits = f"Deltam, {deltam}: 5,0\u00a0mm; E_Uni, {e_uni}: 0,05\u00a0mm"
+    decided = f"{rule}; passes where |E| + U is below 0.05 mm", limits
     dates = "01.02.2026", "02.02.2026 – 03.02.2026", "04.02.2026"
     stated = ("X'1", "0007", "c <7>", "worn & dry", "2025-9", "K 17", "house rule 1", *dates, *decided)
     for text in ("Längenlabor <b>&amp; Söhne</b>", *stated):

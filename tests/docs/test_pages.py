@@ -101,9 +101,18 @@ def run_snippets(page, tmp_path, monkeypatch):
         else:
             for variable in variables(text):
                 monkeypatch.setenv(*variable.split("=", 1))
+            for example in re.findall(r"^\$ cd (examples/\S+)$", text, flags=re.MULTILINE):
+                copy_missing(ROOT / example, folder=tmp_path)
             for command, output in zip(commands(text), outputs(text), strict=True):
                 printed = " ".join(command_line(tmp_path, *command[1:]).stdout.split())
                 assert page not in COMPARED or output.search(printed), (output.pattern, printed)
+
+
+def copy_missing(example, folder):
+    """Files of an example, beside those that the page has written."""
+    for path in example.iterdir():
+        if path.is_file() and not (folder / path.name).exists():
+            (folder / path.name).write_bytes(path.read_bytes())
 
 
 @contextlib.contextmanager

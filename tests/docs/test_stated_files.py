@@ -30,6 +30,14 @@ def test_manifests_are_those_of_the_examples(page, text, example, mukca):
     assert tomllib.loads(table_with(page, text)) == tomllib.loads((mukca.parent / example).read_text())
 
 
+@pytest.mark.parametrize("name", ["session.toml", "bar.toml", "laboratory.toml"])
+def test_files_of_the_measuring_arm_are_those_of_its_page(name):
+    """To the letter: the page's commands are run in the folder of the example."""
+    page = (DOCS / "readers" / "measuring_arm_worked.md").read_text(encoding="utf-8")
+    (block,) = re.findall(rf"<!-- file: {re.escape(name)} -->\n```toml\n(.*?)```", page, flags=re.DOTALL)
+    assert block == (DOCS.parent / "examples" / "measuring_arm" / name).read_text(encoding="utf-8")
+
+
 def test_the_shipped_arms_are_named():
     text = (DOCS / "how_to" / "manifests.md").read_text(encoding="utf-8")
     (sentence,) = re.findall(

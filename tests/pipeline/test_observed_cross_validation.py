@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.calibration.prediction import unseen_errors
 from aacmm_jax.data import observations as kinds
-from aacmm_jax.pipeline.cross_validation import _parts_of, groups_of
+from aacmm_jax.pipeline.cross_validation import _parts_of, groups_of, rms_by
 
 from ..calibration.test_observed import BOX, FRAME, NOISE, PLATE, SIMULATED
 
@@ -114,3 +115,16 @@ def test_some_poses_of_an_observation(paper_arm, kind):
     part = aj.evaluate(paper_arm, rest, noise=NOISE, geometry=whole.geometry).observed
     np.testing.assert_allclose(part.residuals[0], np.asarray(whole.residuals[0])[:, poses], atol=1e-9)
     np.testing.assert_allclose(part.normalised[0], np.asarray(whole.normalised[0])[:, poses], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_errors_of_the_nominal_arm_are_those_that_the_calibrated_one_has_by_the_same_rule(paper_arm, true, bounds):
+    points = {"A": (400, 200, 300), "B": (500, 300, 100)}
+    used = aj.simulate(true, points, poses=25, lengths=[("A", "B", 0.001)], noise=NOISE, seed=5)
+    left = aj.simulate(true, points, poses=6, observations=SIMULATED["bars"], noise=NOISE, seed=6)
+    left = aj.Capture({**left.sockets, "single": left.readings[:1]}, [], left.observations)
+    uncertainty = aj.uncertainty_of(aj.calibrate(paper_arm, used, bounds, noise=NOISE, shared_errors=False))
+    errors = unseen_errors(uncertainty, left)
+    by_calibrated, by_nominal = (rms_by(arm, left, NOISE) for arm in (uncertainty.arm, paper_arm))
+    assert by_calibrated == pytest.approx(errors.of(errors.parts).rms, rel=1e-6)
+    assert by_nominal > 10 * by_calibrated
