@@ -306,6 +306,8 @@ def lengths(rows: Sequence[Mapping[str, Any]], *, fixed_scale: bool = False, pre
 def evaluation(summary: dict[str, Any]) -> View:
     """One evaluation: decisions first, then held-out data, since they are what counts."""
     yield from words.verdict_of(summary)
+    if statable := summary.get("conformity_verdict"):
+        yield f'To state this in a certificate: conformity.verdict = "{statable}" in the file of --about.'
     yield Styled(summary["arm"])
     yield from words.warnings_of(summary)
     yield from words.limits_of(summary)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance.judgement import RULES, Rule, deciding_uncertainty
+from ..acceptance.judgement import RULES, Rule, deciding_uncertainty, worst
 from ..acceptance.record import EvaluationRecord, PointsRecord, check_geometry, unstated_uncertainty_warning
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
 from ..calibration.agreement import NOTHING, Agreement
@@ -77,7 +77,7 @@ def evaluation_summary(
         summary[key] = [judged.says for judged in decisions if judged.decision == decision]
     summary["failed_before"] = {stage: failed_before(summary, record.maxima, stage) for stage in BEFORE}
     tests = record.acceptance() if tests is None else tests
-    summary |= _judged(record, tests)
+    summary |= _judged(record, tests) | {"conformity_verdict": _statable(record, tests["calibrated"])}
     return summary | {"verdict": evaluation_verdict(summary, len(summary["warnings"]))._asdict()}
 
 
@@ -201,6 +201,14 @@ def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = No
         **_judged(record, {"calibrated": tests}),
     }
     return summary | {"verdict": evaluation_verdict(summary, len(summary["warnings"]))._asdict()}
+
+
+def _statable(record: EvaluationRecord, tests: Sequence[AcceptanceTest]) -> str | None:
+    """The verdict of the statement of conformity that a certificate can make, as `Conformity` has it."""
+    if record.recording.true is not None or record.calibration_unusable:
+        return None
+    decision = worst([test.decision for test in tests if test.decision is not None])
+    return {"conforms": "pass", "fails": "fail"}.get(decision or "")
 
 
 def _judged(

@@ -441,3 +441,14 @@ def test_a_manifest_is_evaluated_as_the_capture_that_it_makes(aacmm):
     )
     assert read["held_out"]["sockets"]
     assert read == stored
+
+
+@pytest.mark.slow
+def test_an_evaluation_says_how_a_certificate_states_its_decision(aacmm):
+    of_arm = EXAMPLES / "measuring_arm"
+    aacmm("calibrate", of_arm / "session.toml", "-o", "arm.h5", "--model", "dh", "--no-cross-validate")
+    for limit, verdict in ((0.05, "pass"), (0.001, "fail"), (None, None)):
+        chosen = () if limit is None else ("--mpe", f"Deltam={limit}")
+        said = aacmm("evaluate", "arm.h5", of_arm / "bar.toml", *chosen, expect=int(verdict == "fail")).stdout
+        assert (f'conformity.verdict = "{verdict}"' in " ".join(said.split())) == (verdict is not None)
+        assert ("conformity.verdict" in said) == (verdict is not None)
