@@ -73,8 +73,10 @@ def test_python_prints_what_it_says(capsys):
 @pytest.mark.usefixtures("clone")
 def test_commands_print_what_it_says(aacmm, tmp_path):
     printed = [" ".join(aacmm(*re.sub('"', "", command).split()).stdout.split()) for command in COMMANDS]
-    rows = "their socket's centroid or ([0-9.]+) ([0-9.]+) .*?RMS error of reference lengths ([0-9.]+)"
-    found, predicted, length = map(float, re.findall(rows, printed[0])[0])
+    number = "([0-9.]+)"  # of the nominal arm, of the calibrated arm, predicted
+    rows = f"their socket's centroid or geometry {number} {number} {number} .*?RMS error of reference lengths - {number}"
+    nominal, found, predicted, length = map(float, re.findall(rows, printed[0])[0])
+    assert f"nominal ones are {nominal:.2f} mm off" in " ".join(README.split())
     said = f"{found:.2f} mm RMS, where {predicted:.2f} mm was expected, and its length of 50 mm to {length:.2f} mm"
     assert said in " ".join(README.split())
     assert (tmp_path / "report.html").stat().st_size > 1e5
