@@ -31,7 +31,7 @@ _ON_BOUNDS = {
     "on-bounds": (
         "On a bound: {names}.",
         "All uncertainties, including that of k, are computed as if these values were exact.",
-        "Widen the bounds, unless they are true limits of these parameters.",
+        "Widen the bounds (--length-bound-mm, --angle-bound-deg), unless they are true limits of these parameters.",
     ),
 }
 

@@ -43,6 +43,7 @@ Solve = Callable[[Recording], Calibration | Identification]
 Record = Callable[[Calibration | Identification, Recording], CalibrationRecord]
 
 _WIDER, _ROUNDS = 5.0, 4  # factor by which bounds that were reached are widened, and how often
+_AS_GOOD = 1.02  # factor of the residuals up to which a calibration without parameters on such bounds is taken
 _WIDEST = np.pi / 2  # rad
 _BEYOND = 1.5  # half-width of a bound, over the change of its parameter in a rough fit
 _SIZE = 2.0  # factor within which the size of an arm stays that of the nominal one
@@ -111,7 +112,9 @@ def with_wider_bounds(record: CalibrationRecord, solve: Solve, recorded: Record)
         size, usual = (total_link_length(arm) for arm in (wider.calibrated.arm, nominal.arm))
         # Points in a wrong unit fit an arm that shrinks, or grows, with its bounds.
         of_this_size = usual / _SIZE < size < usual * _SIZE
-        if wider.converged and of_this_size and _is_better(wider, best, len(reached)):
+        # A bound that was set here is to hold no parameter, since U counts none that are on a bound.
+        frees = best is not record and not on_bounds(wider) and wider.observed.rms < _AS_GOOD * best.observed.rms
+        if wider.converged and of_this_size and (frees or _is_better(wider, best, len(reached))):
             best = wider
     if best is record:
         return record

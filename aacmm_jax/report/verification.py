@@ -58,7 +58,8 @@ def verification_report(
         )
         for name, found in reversed(arms.items())
     ]
-    last = (length_errors(summary), meaning(summary), counted(summary))
+    tables = [] if checked.same else [accuracy_table(summary)]  # one row repeats the numbers beside the picture
+    last = (length_errors(summary), f"{meaning(summary)} {counted(summary)}")
     volume = ("Expected over the working volume", f"{checked.volume:.2g} mm", "RMS, as delivered")
     found, not_tested = (summary["poses_say"], summary["gain_says"]), "; ".join(summary["not_tested"])
     left = f"over the working volume, in place of {checked.volume:.2g} mm"
@@ -66,7 +67,7 @@ def verification_report(
     if "calibrated" in summary:
         tested = summary["calibrated"]
         calibrated = ("Calibrated, held-out poses", f"{tested['rms_mm']:.3g} mm", tested["of_poses"])
-        found = (tested["says"], summary["next"], *found)
+        found = (" ".join(filter(None, [tested["says"], summary["next"]])), *found[: 1 if checked.same else None])
     return Report(
         title=f"Verification of delivered parameters, {summary['arm'] or 'an arm'}",
         subtitle=f"{summary['tested']} {pluralise(checked.poses, 'pose')}.",
@@ -82,7 +83,7 @@ def verification_report(
         one_page=True,
         facts=[],
         sections=[
-            Section("found", "What was found", [*filter(None, found), accuracy_table(summary), *filter(None, last)]),
+            Section("found", "What was found", [*filter(None, found), *tables, *filter(None, last)]),
             Section("not-tested", "What was not tested", [not_tested[:1].upper() + not_tested[1:] + "."]),
         ],
     )

@@ -97,6 +97,11 @@ def test_the_held_out_result_of_a_calibration_stands_beside_the_verdict(aacmm, r
     for text in (says, "Calibrated, held-out poses", "Of the calibrated arm: each pose when it was held out"):
         assert text in page
     assert "Tested as delivered: the published nominal parameters, not what your controller computes." in page
+    assert page.index("<h2") < page.index(" equations, ")  # the colleague reads the verdict first
+    assert all(
+        f"{name} {error:.3f}" in page
+        for name, error in zip(summary["lengths"], summary["accuracy"][0]["length_errors_mm"], strict=True)
+    )
     good = json.loads(aacmm(*options, "c.h5", "--max-rms-mm", "1", "--json").stdout)
     assert good["says"].startswith("Calibrated, good enough for 1 mm RMS: ")
     assert (good["calibrated"]["poses"], good["calibrated"]["beyond"]) == (good["poses"], 0)

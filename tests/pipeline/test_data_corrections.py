@@ -1,11 +1,18 @@
 """What `calibrate_capture` corrects where nothing is stated: too few data, and readings that are not the arm's."""
 
+import re
+from importlib import metadata
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
 from aacmm_jax.data.observations import MeasuredPoints
+from aacmm_jax.diagnostics.usability import on_bounds
+
+ROOT = Path(__file__).parents[2]
 
 OFFSET = np.array([40.0, -20.0, 90.0])  # of the reflector in the last frame, mm
 OPTIONS = {"cross_validate": False, "shared_errors": False}
@@ -187,3 +194,21 @@ def test_zeros_of_an_evaluation_are_not_corrected():
     evaluation = aj.evaluate_capture(record, wrong)
     assert "unless the zero of joint 3 is -28" in evaluation.warnings[0]
     assert np.array_equal(evaluation.recording.capture.observations[0].q, wrong.capture.observations[0].q)
+
+
+@pytest.mark.slow
+def test_no_parameter_stays_on_a_bound_that_was_widened(tmp_path):
+    """An SO-101 from its URDF: theta_2 stayed on a bound of 1.75 deg that was set here, so U took it as exact."""
+    pytest.importorskip("cv2")
+    urdf = next((f for f in metadata.files("example-robot-data") or () if f.name == "so101.urdf"), None)
+    if urdf is None:
+        pytest.skip("the SO-101 of example-robot-data is not installed")
+    page = (ROOT / "docs" / "readers" / "hobby_arm.md").read_text()
+    manifest = re.search(r"```toml\n(arm = .*?)```", page, re.DOTALL)[1]
+    arm = f'arm = "{urdf.locate()}"\ntip = "gripper_frame_link"'
+    manifest = re.sub('arm = "so100".*', arm, manifest).replace("examples/", f"{ROOT / 'examples'}/")
+    (tmp_path / "my-arm.toml").write_text(manifest)
+    record = aj.calibrate_capture(aj.files.read_manifest(tmp_path / "my-arm.toml"), model="dh")
+    assert any(decision.startswith("Default bounds were widened") for decision in record.decisions)
+    assert on_bounds(record) == {}
+    assert record.observed.rms < 0.5
