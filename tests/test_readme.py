@@ -74,7 +74,8 @@ def test_python_prints_what_it_says(capsys):
 def test_commands_print_what_it_says(aacmm, tmp_path):
     printed = [" ".join(aacmm(*re.sub('"', "", command).split()).stdout.split()) for command in COMMANDS]
     number = "([0-9.]+)"  # of the nominal arm, of the calibrated arm, predicted
-    rows = f"their socket's centroid or geometry {number} {number} {number} .*?RMS error of reference lengths - {number}"
+    three = " ".join([number] * 3)
+    rows = f"their socket's centroid or geometry {three} .*?RMS error of reference lengths - {number}"
     nominal, found, predicted, length = map(float, re.findall(rows, printed[0])[0])
     assert f"nominal ones are {nominal:.2f} mm off" in " ".join(README.split())
     said = f"{found:.2f} mm RMS, where {predicted:.2f} mm was expected, and its length of 50 mm to {length:.2f} mm"
