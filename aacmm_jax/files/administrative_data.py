@@ -21,7 +21,7 @@ NO_COUNTRY = "ZZ"  # reserved for users by ISO 3166-1: a certificate must have a
 _LOOKED_FOR = {  # ISO/IEC 17025:2017, 7.8.2.1
     "laboratory": ("name", "city"),
     "customer": ("name", "city"),
-    "item": ("manufacturer", "model", "serial_number", "condition"),
+    "item": ("name", "manufacturer", "model", "serial_number", "condition"),
     "certificate": ("number", "received", "begin", "issued", "temperature_celsius"),
 }
 _LARGEST_LOGO, _MOST_PIXELS, _PNG = 1_000_000, 10_000_000, b"\x89PNG\r\n\x1a\n"  # bytes, pixels
