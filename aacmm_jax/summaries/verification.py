@@ -216,8 +216,9 @@ def _next(does: str, calibrated: Calibrated) -> str:
         return ""
     model = " of a calibration with --model dh" if calibrated.corrections else ""
     return (
-        f"Correct targets (aacmm correct {calibrated.file} TARGETS.csv -o corrected.csv), or write the "
-        f"parameters{model} to a URDF or a file of the controller (aacmm export)."
+        f"Write the parameters{model} to a URDF or a file of the controller (aacmm export), or, if the controller "
+        "keeps the parameters tested here, correct targets "
+        f"(aacmm correct {calibrated.file} TARGETS.csv -o corrected.csv)."
     )
 
 
