@@ -148,9 +148,9 @@ def test_backlash_is_named_and_found(nominal):
 @pytest.mark.slow
 def test_play_that_gravity_decides_is_named_without_directions():
     """Nothing is recorded but the readings; half of 0.2 deg is 360 arcsec."""
-    arm = aj.load_arm("ur10e")
-    capture = recorded(arm, {"hang_2": np.radians(0.2), "hang_3": np.radians(0.2)})
-    record = calibrate_capture(aj.Recording(capture, ArmSpecification(arm)), model="dh", **QUICKLY)
+    specification = aj.files.load_specification("ur10e")  # holds what parallel axes do not determine
+    capture = recorded(specification.arm, {"hang_2": np.radians(0.2), "hang_3": np.radians(0.2)})
+    record = calibrate_capture(aj.Recording(capture, specification), model="dh", **QUICKLY)
     text = " ".join(sentences(findings_of(record)))
     assert "the side to which gravity turns joint 3 (360 arcsec)" in text
     assert "try --model dh,backlash=gravity" in text
