@@ -3,14 +3,13 @@
 import csv
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.core.units import DEG
-from aacmm_jax.diagnostics.reading_search import Hypothesis
+from aacmm_jax.diagnostics.reading_fit import Explanation
 from aacmm_jax.files.controllers.tables import python_program
 from aacmm_jax.pipeline.data_corrections import recorded_as_corrected
 
@@ -86,7 +85,7 @@ def test_readings_that_a_calibration_corrected_are_taken_as_recorded(tmp_path):
 def test_corrected_readings_are_written_as_before():
     """By hand: the second column is joint 1 and counts the other way, and readings are in degrees, not in rad."""
     written = aj.data.RecordedAs(("a", "b"), "rad", np.diag([1.0, -1.0]), np.array([0.25, 0.5]))
-    explanation = SimpleNamespace(order=(1, 0), angle=DEG, hypothesis=Hypothesis((1, 0), (-1, 1), (0.0, 7.0), DEG))
+    explanation = Explanation((1, 0), (-1, 1), (0.0, 7.0), DEG, length=1.0, rms=0.0, rms_fitted=0.0, outside=0)
     corrected = recorded_as_corrected(written, explanation)
     assert (corrected.names, corrected.unit) == (("a", "b"), "deg")
     # b = 20 was read as 0.5 - 20, and a = 10 as 10.25.
