@@ -17,6 +17,15 @@ SCARA = aj.Arm(  # two parallel links, a quill that points down, and its rotatio
     limits=[(-2.3, 2.3), (-2.5, 2.5), (50.0, 350.0), (-3.0, 3.0)],
 )
 
+PLATE_FOR_SCARA = """
+[[artefact]]
+name = "plate"
+points = { a = [0, 0, 0], b = [200, 0, 0], c = [0, 150, 0], d = [200, 150, 40] }
+frame = [0, 0, 0.3, 350, -50, 120]
+poses = 6
+u = 0.002
+"""
+
 GANTRY = aj.Arm(  # slides along z, y and x, and a wrist whose axes meet
     alpha=[-QUARTER, -QUARTER, 0.0, QUARTER, -QUARTER, 0.0],
     a=np.zeros(6),

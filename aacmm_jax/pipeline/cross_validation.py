@@ -220,13 +220,19 @@ def left_out_group(
 def rms_by(arm: Arm, left: Capture, noise: Noise) -> float | None:
     """RMS distance of poses from the geometry that fits an arm best in them, mm, without sockets of one pose; None
     where there is no other."""
-    arm, left = to_numpy((arm, without_lengths(left)))
-    observed = to_numpy(Observed.of(left, arm))
-    fitted = observed.split(np.asarray(fit_geometry(arm, observed, {}, noise).geometry))
-    by_part = zip((*left.sizes, *(len(o.q) for o in left.observations)),
-                  distances_of(left, evaluate(arm, left, geometry=fitted)), strict=True)  # fmt: skip
-    counted = [distances for i, (poses, distances) in enumerate(by_part) if poses > 1 or i >= len(left.sizes)]
+    left = without_lengths(left)
+    by_part = enumerate(distances_by(arm, left, left, noise))
+    counted = [distances for i, distances in by_part if len(distances) > 1 or i >= len(left.sizes)]
     return rms(np.concatenate(counted)) if counted else None
+
+
+def distances_by(arm: Arm, fitted: Capture, poses: Capture, noise: Noise | None) -> tuple[Float[np.ndarray, " m"], ...]:
+    """Distances of poses, mm, of each socket, then of each observation, from the geometry that fits an arm best in the
+    poses of ``fitted``."""
+    arm, fitted, poses = to_numpy((arm, fitted, poses))
+    observed = to_numpy(Observed.of(fitted, arm, lengths=False))
+    geometry = observed.split(np.asarray(fit_geometry(arm, observed, {}, noise).geometry))
+    return distances_of(poses, evaluate(arm, poses, geometry=geometry))
 
 
 def _check_some_left(pattern: str, some: bool) -> None:

@@ -5,21 +5,17 @@ import fnmatch
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from ..acceptance.record import EvaluationRecord
 from ..calibration.agreement import CrossValidation
-from ..calibration.evaluation import evaluate, fit_geometry
 from ..calibration.pose_table import HELD_OUT, PoseResiduals, joined_rows, residuals_by_pose
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.arguments import checked_arguments
 from ..core.errors import InputError, nearest
-from ..core.numpy_or_jax import to_numpy
 from ..core.random_keys import random_generator
 from ..data.capture import Capture, drawn_poses, names_in, part_of
-from ..diagnostics.pose_residuals import distances_of
-from ..model.observed import Observed
-from .cross_validation import left_out_group
+from .cross_validation import distances_by, left_out_group
 
 Masks = Mapping[str, Bool[np.ndarray, " m"]]  # observation -> which of its poses are held out
 
@@ -95,23 +91,16 @@ def tested(record: CalibrationRecord, capture: Capture, masks: Masks) -> Calibra
     whole, uncertainty = part_of(capture, names), uncertainty_of(record)
     used = np.concatenate([~masks[name] for name in names_in(whole)])
     rows = residuals_by_pose(uncertainty, whole, used, record.observed.geometry).used_as(HELD_OUT)
-    by_nominal = _nominal_distances(record, whole)[~used] if record.names else None
+    by_nominal = None
+    if record.names:  # as in a calibration with all parameters of the arm held
+        nominal = distances_by(record.recording.nominal.arm, record.recording.capture, whole, record.given_noise)
+        by_nominal = np.concatenate(nominal)[~used]
     record = record._replace(held_out=rows, held_out_nominal=by_nominal)
     if record.validation is not None or any(0 < np.sum(mask) < len(mask) for mask in masks.values()):
         return record
     nominal = record.recording.nominal.arm
     group = left_out_group(uncertainty, _where(capture, masks), record.converged, nominal=nominal)
     return record._replace(validation=CrossValidation((group,)))
-
-
-def _nominal_distances(record: CalibrationRecord, whole: Capture) -> Float[np.ndarray, " m"]:
-    """Distances of all poses by the nominal arm from the geometry that it has in the poses of the calibration, mm, as
-    in a calibration with all parameters of the arm held."""
-    nominal = to_numpy(record.recording.nominal.arm)
-    observed = to_numpy(Observed.of(record.recording.capture, nominal, lengths=False))
-    found = fit_geometry(nominal, observed, {}, record.given_noise)
-    by_nominal = evaluate(nominal, whole, geometry=observed.split(found.geometry))
-    return np.concatenate(distances_of(whole, by_nominal))
 
 
 @checked_arguments

@@ -17,7 +17,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.kinematics.arm import joint_limits
 
-from ..prismatic_arms import SCARA
+from ..prismatic_arms import PLATE_FOR_SCARA, SCARA
 from .test_page import browser, shown  # noqa: F401 - fixtures
 
 SOCKETS = "".join(
@@ -51,14 +51,6 @@ box = [[300, -500, 200], [800, 500, 800]]
 poses = 40
 u = 0.02
 """
-QUILL = """
-[[artefact]]
-name = "plate"
-points = { a = [0, 0, 0], b = [200, 0, 0], c = [0, 150, 0], d = [200, 150, 40] }
-frame = [0, 0, 0.3, 350, -50, 120]
-poses = 6
-u = 0.002
-"""
 CAMERA = (
     (Path(__file__).parents[2] / "examples" / "webcam" / "kit.toml")
     .read_text()
@@ -84,7 +76,7 @@ ARMS = {
     "Panda in sockets": (("panda",), SOCKETS, "", 20),
     "UR with a tracker": (("ur10e",), TRACKER, "", 16),
     "SO-101 with a camera": (so101, CAMERA, "length=1&angle=0.01", 18),
-    "SCARA": (scara, QUILL, "", 20),
+    "SCARA": (scara, PLATE_FOR_SCARA, "", 20),
 }
 
 

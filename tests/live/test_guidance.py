@@ -19,7 +19,7 @@ from aacmm_jax.live.places import Setup, TakenPose, setup_of
 from aacmm_jax.planning.designs import Candidates, covariance_of
 from aacmm_jax.planning.problem import PlanOptions
 
-from ..prismatic_arms import SCARA
+from ..prismatic_arms import PLATE_FOR_SCARA, SCARA
 
 NAME = "cheng2018-simulation"
 PLACES = {"A": (400, 300, 500), "B": (600, -300, 300), "C": (-300, 500, 300), "D": (300, 200, 900)}
@@ -240,21 +240,11 @@ def test_places_that_have_the_poses_that_are_wanted_wait_for_the_others() -> Non
     assert chosen.place == "A"
 
 
-PLATE = """
-[[artefact]]
-name = "plate"
-points = { a = [0, 0, 0], b = [200, 0, 0], c = [0, 150, 0], d = [200, 150, 40] }
-frame = [0, 0, 0.3, 350, -50, 120]
-poses = 6
-u = 0.002
-"""
-
-
 @pytest.mark.slow
 def test_poses_give_what_was_promised_where_things_stand_elsewhere_than_stated(tmp_path: Path) -> None:
     # Rows where the plate was stated seemed to tell tilts of a SCARA apart, pose after pose, that no pose told apart.
     aj.files.save_arm(SCARA, tmp_path / "scara.toml", name="SCARA")
-    (tmp_path / "kit.toml").write_text(PLATE)
+    (tmp_path / "kit.toml").write_text(PLATE_FOR_SCARA)
     guide = Guide(aj.live.read_setup(tmp_path / "scara.toml", kit=tmp_path / "kit.toml"))
     search, random = guide.search, np.random.default_rng(0)
     true = to_numpy(aj.perturbed_arm(search.problem.space, length=0.2, angle=5e-4, seed=0))
